@@ -1,0 +1,47 @@
+"""Checks of public arguments: every message quotes the argument, what it got and what it expected.
+
+They read shapes and dtypes only, so they run at trace time, once per compilation.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+
+Size = tuple[int, int]
+
+
+def check_array(name: str, value: Any, *, shape: Sequence[int | str]) -> tuple[int, ...]:
+    """The shape of `value`, after checking that it is a floating-point array of that `shape`.
+
+    An integer in `shape` must be met exactly; a string names a size that may be anything from 1 on.
+    """
+    expected = "[" + ", ".join(str(s) for s in shape) + "]"
+    if not hasattr(value, "shape") or not hasattr(value, "dtype"):
+        raise TypeError(f"{name}: expected a floating-point array {expected}, got {type(value).__name__}")
+    if not jnp.issubdtype(value.dtype, jnp.floating):
+        raise TypeError(f"{name}: expected a floating-point array {expected}, got dtype {value.dtype}")
+    got = tuple(value.shape)
+    fits = len(got) == len(shape) and all(g >= 1 and (isinstance(s, str) or g == s) for g, s in zip(got, shape))
+    if not fits:
+        raise ValueError(f"{name}: expected shape {expected}, got {list(got)}")
+    return got
+
+
+def check_image(name: str, value: Any, *, size: Size | None = None, channels: int | None = None) -> Size:
+    """`(H, W)` of an image `[H, W, C]`, after checking rank, dtype and, where given, size and channels."""
+    height, width = ("H", "W") if size is None else size
+    shape = check_array(name, value, shape=(height, width, "C" if channels is None else channels))
+    return shape[0], shape[1]
+
+
+def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    """Raise `ValueError` with the valid ones unless `value` is one of `choices`."""
+    if value not in choices:
+        raise ValueError(f"{name}: expected one of {', '.join(repr(c) for c in choices)}, got {value!r}")
+
+
+def check_present(name: str, value: Any, *, needed_by: str) -> None:
+    """Raise `ValueError` where a buffer that is needed is absent (`None`)."""
+    if value is None:
+        raise ValueError(f"{name}: absent (None), but {needed_by} needs it")

@@ -1,0 +1,1 @@
+"""The commands of `jaxtrapolate`, one module each."""

@@ -1,0 +1,37 @@
+"""`jaxtrapolate demo`: an embedded scene, every method, error against run time, pictures, a report."""
+
+import argparse
+from typing import Any
+
+from rich.console import Console
+
+from jaxtrapolate.commands.evaluate import evaluate, print_table
+from jaxtrapolate.commands.inputs import output_folder
+from jaxtrapolate.commands.render import parse_size
+from jaxtrapolate.methods import load, method_names
+
+
+def add_parser(subparsers: Any) -> None:
+    """Adds the command to the command line."""
+    parser = subparsers.add_parser(
+        "demo",
+        help="every method on an embedded scene: table, pictures, HTML report; needs no data",
+        description="Renders a small embedded scene and evaluates every method on it. No data, no network.",
+    )
+    parser.add_argument("--output", default="demo", metavar="DIR", help="for results, pictures and report (demo)")
+    parser.add_argument("--frames", type=int, default=16, metavar="N", help="how many frames (16)")
+    parser.add_argument("--size", default="480x270", metavar="WxH", help="width and height in pixels (480x270)")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Runs the command."""
+    from jaxtrapolate.scenes import SceneSequence
+
+    folder = output_folder(options.output)
+    sequence = SceneSequence("demo", frames=options.frames, size=parse_size(options.size))
+    methods = {name: load(name) for name in method_names()}
+    console = Console(stderr=True)
+    results = evaluate(sequence, methods, folder, console=console)
+    print_table(results, Console())
+    console.print(f"open {folder / 'report.html'}; numbers in {folder / 'results.json'}", soft_wrap=True, highlight=False)

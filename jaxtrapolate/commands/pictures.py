@@ -1,0 +1,77 @@
+"""The pictures of an evaluated frame, for the report."""
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtrapolate.commands.inputs import output_folder
+from jaxtrapolate.evaluation import Window, arguments, causes_of, display
+from jaxtrapolate.files import Sequence, write_png
+from jaxtrapolate.holes import hole_masks
+from jaxtrapolate.methods import Method
+from jaxtrapolate.records import CHANNELS, GBuffer
+from jaxtrapolate.report import colorize_causes, colorize_error
+
+
+def eight_bit(image: Any) -> np.ndarray:
+    """Display values 0..1 as 8-bit RGB."""
+    codes = np.round(np.nan_to_num(np.clip(np.asarray(image, np.float32), 0, 1)) * 255).astype(np.uint8)
+    return np.repeat(codes, 3, -1) if codes.shape[-1] == 1 else codes
+
+
+def buffer_picture(name: str, value: Any) -> np.ndarray:
+    """A buffer as a picture: normals from -1..1, what has no range of its own between its 1st and 99th percentile."""
+    value = np.asarray(value, np.float32)
+    if name == "normal":
+        return eight_bit(value * 0.5 + 0.5)
+    if name in ("depth", "position", "stencil"):
+        finite = np.where(np.isfinite(value), value, np.nan)
+        low, high = np.nanpercentile(finite, (1, 99), axis=(0, 1)) if np.isfinite(value).any() else (0.0, 1.0)
+        high = np.maximum(high, value.max(axis=(0, 1))) if name == "stencil" else high
+        return eight_bit((np.nan_to_num(value) - low) / np.maximum(high - low, 1e-6))
+    return eight_bit(value)
+
+
+def write_pictures(sequence: Sequence, window: Window, methods: dict[str, Method], folder: Path) -> dict[str, Any]:
+    """Writes the pictures of a window below `folder/pictures`; returns their paths, relative to `folder`."""
+    place = output_folder(str(folder / "pictures" / f"{window.number:04d}"))
+
+    def put(name: str, codes: np.ndarray) -> str:
+        write_png(place / f"{name}.png", codes)
+        return (place / f"{name}.png").relative_to(folder).as_posix()
+
+    truth = np.asarray(display(window.truth.color, hdr=sequence.hdr))
+    newest = window.history[-1]
+    here, there = window.target.gbuffer or GBuffer(), newest.gbuffer or GBuffer()
+    pictures: dict[str, Any] = {
+        "number": window.number,
+        "truth": put("truth", eight_bit(truth)),
+        "previous": put("previous", eight_bit(display(newest.color, hdr=sequence.hdr))),
+        "causes": put("causes", colorize_causes(causes_of(sequence, window))),
+        "methods": {},
+        "buffers": {},
+    }
+    if window.target.motion is not None:
+        holes = hole_masks(here, there, window.target.motion).any
+        pictures["holes"] = put("holes", eight_bit(jnp.where(holes, jnp.array([0.1, 0.9, 0.2]), truth * 0.5)))
+    for name, method in methods.items():
+        image = np.asarray(display(method(*arguments(method, window)), hdr=sequence.hdr))
+        error = np.abs(image - truth).mean(-1)
+        pictures["methods"][name] = {
+            "image": put(f"{name}", eight_bit(image)),
+            "error": put(f"{name}_error", colorize_error(error)),
+        }
+    shown = window.truth.gbuffer or GBuffer()
+    for name in CHANNELS:
+        value = getattr(shown, name)
+        if value is not None:
+            picture = display(value, hdr=True) if name == "sky_color" else value
+            pictures["buffers"][name] = put(f"buffer_{name}", buffer_picture(name, picture))
+    if window.truth.motion is not None:
+        motion = np.asarray(window.truth.motion)
+        largest = max(float(np.nanpercentile(np.abs(motion), 99)), 1e-3)
+        colors = np.concatenate([motion / largest * 0.5 + 0.5, np.full((*motion.shape[:2], 1), 0.5, np.float32)], -1)
+        pictures["buffers"]["motion"] = put("buffer_motion", eight_bit(colors))
+    return pictures

@@ -1,0 +1,98 @@
+"""Sequences of frames in files: finding the reader, gaps in the numbering, reading ahead, and writing."""
+
+import itertools
+import os
+from pathlib import Path
+
+from jaxtrapolate.files.exr import read_exr as read_exr
+from jaxtrapolate.files.exr import write_exr as write_exr
+from jaxtrapolate.files.image import read_png as read_png
+from jaxtrapolate.files.image import write_frame as write_frame
+from jaxtrapolate.files.image import write_png as write_png
+from jaxtrapolate.files.packed import CONVENTION as _PACKED
+from jaxtrapolate.files.packed import PackedSequence as PackedSequence
+from jaxtrapolate.files.packed import packed_folder
+from jaxtrapolate.files.pattern import SETTINGS_NAME as SETTINGS_NAME
+from jaxtrapolate.files.pattern import PatternSequence as PatternSequence
+from jaxtrapolate.files.pattern import read_settings
+from jaxtrapolate.files.prefetch import prefetch as prefetch
+from jaxtrapolate.files.reader import FileSequence, list_folder
+from jaxtrapolate.files.sequence import InputError as InputError
+from jaxtrapolate.files.sequence import MotionConvention as MotionConvention
+from jaxtrapolate.files.sequence import Sequence as Sequence
+from jaxtrapolate.files.unreal import CONVENTION as _UNREAL
+from jaxtrapolate.files.unreal import UnrealSequence as UnrealSequence
+from jaxtrapolate.files.unreal import unreal_files
+from jaxtrapolate.files.unreal import write_unreal_frame as write_unreal_frame
+
+
+def open_sequence(
+    path: str | os.PathLike[str],
+    *,
+    motion: str | MotionConvention | None = None,
+    settings: str | os.PathLike[str] | None = None,
+    strict: bool = False,
+) -> Sequence:
+    """The sequence in a folder, by whichever reader fits.
+
+    In this order: a TOML file with `[buffers]` -> `PatternSequence`; names of an Unreal dump -> `UnrealSequence`;
+    folders `color` or `motion` of PNG files -> `PackedSequence`.
+
+    Args:
+        path: a folder, or the TOML file in it.
+        motion: how the motion vectors are stated, e.g. "current_minus_previous,pixels,up"; what a text does not say
+            is the TOML file's, or the reader's default. Goes before the TOML file.
+        settings: the TOML file, where it is not `jaxtrapolate.toml` in the folder.
+        strict: refuse gaps in the numbering now, and a frame with a non-finite pixel when it is read.
+
+    Raises:
+        InputError: one line that names the file and the remedy: no such folder, a file, an empty folder, nothing that
+            a reader knows, a missing file, files of different sizes, a TOML file or `motion` that cannot be used.
+    """
+    folder = Path(path)
+    if settings is None and folder.suffix == ".toml" and not folder.is_dir():
+        folder, settings = folder.parent, folder
+    names = list_folder(folder)
+    if not names:
+        raise InputError(f"{folder}: is empty; give the folder that holds the frames")
+    if settings is None and SETTINGS_NAME in names:
+        settings = folder / SETTINGS_NAME
+    stated = None if settings is None else read_settings(settings)
+
+    def convention(base: MotionConvention) -> MotionConvention:
+        base = base if stated is None else stated.convention(base)
+        return MotionConvention.parse(motion, base=base) if isinstance(motion, str) else motion or base
+
+    sequence: FileSequence
+    if stated is not None and stated.buffers:
+        own = convention(MotionConvention())
+        sequence = PatternSequence(folder, settings=stated, motion=own, strict=strict)
+    elif unreal_files(names):
+        sequence = UnrealSequence(folder, motion=convention(_UNREAL), strict=strict)
+    elif packed_folder(folder) is not None:
+        sequence = PackedSequence(folder, motion=convention(_PACKED), strict=strict)
+    else:
+        kinds = "<Scene><Buffer>.<0000>.exr, or color/ and motion/ with NNNN.png"
+        raise InputError(f"{folder}: no frames found ({kinds}); describe its files in a {SETTINGS_NAME}")
+    if strict and (missing := gaps(sequence)):
+        first = missing[0]
+        span = f"frame {first[0]}" if len(first) == 1 else f"frames {first[0]} to {first[-1]}"
+        raise InputError(f"{folder}: {span} missing; render what is missing, or read it without strict")
+    return sequence
+
+
+def runs(sequence: Sequence) -> tuple[range, ...]:
+    """The stretches of the numbering without a gap, in order; together they are all of `sequence.numbers`."""
+    out: list[range] = []
+    for number in sequence.numbers:
+        if out and number == out[-1].stop:
+            out[-1] = range(out[-1].start, number + 1)
+        else:
+            out.append(range(number, number + 1))
+    return tuple(out)
+
+
+def gaps(sequence: Sequence) -> tuple[range, ...]:
+    """The missing numbers between the first and the last frame, a range for each gap; a gap resets the history."""
+    stretches = runs(sequence)
+    return tuple(range(a.stop, b.start) for a, b in itertools.pairwise(stretches))

@@ -1,0 +1,65 @@
+"""Files that are there in full or not at all, and operating-system errors as one clear line."""
+
+import contextlib
+import errno
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+from jaxtrapolate.files.sequence import InputError
+
+Action = Literal["read", "write"]
+
+_REMEDIES = {
+    errno.ENOENT: "does not exist; check the path",
+    errno.ENOTDIR: "does not exist (a folder of its path is a file); check the path",
+    errno.EISDIR: "is a folder, not a file; check the path",
+    errno.EACCES: "no permission to {action} it; change its permissions or choose another place",
+    errno.EPERM: "no permission to {action} it; change its permissions or choose another place",
+    errno.EROFS: "cannot be written, the file system is read-only; choose another place",
+    errno.ENOSPC: "cannot be written, the disk is full; free some space and run again",
+    errno.EDQUOT: "cannot be written, the disk quota is used up; free some space and run again",
+    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
+    errno.EMFILE: "too many open files; raise the limit (ulimit -n)",
+}
+
+
+def os_input_error(path: str | os.PathLike[str], error: OSError, *, action: Action = "read") -> InputError:
+    """The `InputError` that says in one line what an `OSError` on `path` means and what to do about it."""
+    remedy = _REMEDIES.get(error.errno or 0, f"cannot be {'read' if action == 'read' else 'written'} ({{error}})")
+    text = remedy.format(action=action, error=error.strerror or " ".join(str(error).split()))
+    return InputError(f"{path}: {text}")
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """The name of an empty temporary file beside `path`, which takes its place when the block ends without an error.
+
+    On any error in the block or in the renaming (a full disk, Ctrl-C) the temporary file is removed and what was at
+    `path` before stays as it was. Only a process that is killed outright leaves a temporary file, whose name starts
+    with a dot and ends in `.tmp`; it never leaves half a file at `path`. The folder must exist.
+
+    Raises:
+        InputError: for every `OSError`, naming `path`.
+    """
+    path = Path(path)
+    temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp"
+    try:
+        if path.is_dir():
+            raise OSError(errno.EISDIR, os.strerror(errno.EISDIR))
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    except OSError as error:
+        if error.errno == errno.ENOENT:
+            raise InputError(f"{path}: its folder does not exist; create it first") from error
+        raise os_input_error(path, error, action="write") from error
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError):
+            raise os_input_error(path, error, action="write") from error
+        raise

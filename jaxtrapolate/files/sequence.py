@@ -1,0 +1,108 @@
+"""A sequence of frames on disk or from a scene: the one interface between inputs and everything else.
+
+A further reader is one file with one subclass of `Sequence`, named in `jaxtrapolate.files.open_sequence`.
+"""
+
+import abc
+import dataclasses
+from typing import Literal, get_args
+
+import numpy as np
+
+from jaxtrapolate.motion import Sign, Units, YAxis
+from jaxtrapolate.records import Frame, Keyframe
+
+
+class InputError(Exception):
+    """Input that cannot be used; the message is one line that names the file and the remedy."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionConvention:
+    """How a file states motion vectors; the fields are the options of `jaxtrapolate.convert_motion`.
+
+    The default is the library's own convention: pixels to add, y down, to reach the previous frame.
+    """
+
+    sign: Sign = "previous_minus_current"
+    units: Units = "pixels"
+    y_axis: YAxis = "down"
+
+    def __str__(self) -> str:
+        return f"{self.sign},{self.units},{self.y_axis}"
+
+    @classmethod
+    def parse(cls, text: str, *, base: "MotionConvention | None" = None) -> "MotionConvention":
+        """From "current_minus_previous,pixels,up": up to three words in any order, separated by commas.
+
+        What the text does not say is taken from `base`, by default the library's own convention.
+        """
+        fields = {}
+        for word in filter(None, (w.strip() for w in text.split(","))):
+            for field, choices in (("sign", get_args(Sign)), ("units", get_args(Units)), ("y_axis", get_args(YAxis))):
+                if word in choices:
+                    fields[field] = word
+                    break
+            else:
+                valid = ", ".join(get_args(Sign) + get_args(Units) + get_args(YAxis))
+                raise InputError(f"motion convention {text!r}: {word!r} is not one of {valid}")
+        return dataclasses.replace(base or cls(), **fields)
+
+
+class Sequence(abc.ABC):
+    """Frames by number, read lazily; every leaf is a NumPy float32 array.
+
+    Attributes:
+        name: of the input, for reports.
+        numbers: of the frames that are there, ascending; a gap resets a method's history.
+        size: `(H, W)`.
+        hdr: whether colour is HDR (scored after x / (1 + x) and gamma 1 / 2.2, written as EXR) or 8-bit sRGB
+            (scored in sRGB, written as PNG). `Frame.color` is linear either way.
+        convention: how the stored motion vectors are stated; `frame` has converted them.
+        depth: "metric" (in the unit of position), "ordinal" (larger = farther, and no more than that) or "absent".
+        forward_motion: whether `keyframe` gives flows to the next frame as well.
+        notes: what the reader did that a user should know, one line each ("frame 0 left out: ...").
+    """
+
+    name: str
+    numbers: tuple[int, ...]
+    size: tuple[int, int]
+    hdr: bool
+    convention: MotionConvention
+    depth: Literal["metric", "ordinal", "absent"]
+    forward_motion: bool = False
+    notes: tuple[str, ...] = ()
+
+    @abc.abstractmethod
+    def frame(self, number: int) -> Frame:
+        """The frame with every buffer that is there; colour `None` where only buffers were drawn.
+
+        Non-finite pixels have been replaced as `jaxtrapolate.files.repair` says.
+        """
+
+    def has_color(self, number: int) -> bool:
+        """Whether the frame has colour, without reading it."""
+        return True
+
+    def stored_motion(self, number: int) -> np.ndarray | None:
+        """The motion vectors `[H, W, 2]` as they are stored, before `convention` is applied."""
+        return None
+
+    def keyframe(self, number: int) -> Keyframe | None:
+        """The frame's 3D flows to its neighbours in the numbering, `None` where the input has none.
+
+        Flows are in the library's convention, the change of depth in the unit of position. They are finite: where a
+        stored one is not, the nearest finite one stands in.
+        """
+        return None
+
+    def invalid(self, number: int) -> np.ndarray | None:
+        """The pixels, bool `[H, W]`, that had a non-finite value in some buffer; `None` where there is none.
+
+        They hold made-up values (`jaxtrapolate.files.repair`), so scores leave them out.
+        """
+        return None
+
+    def nonfinite(self, number: int) -> int:
+        """How many pixels of the frame had a non-finite value in some buffer."""
+        return 0

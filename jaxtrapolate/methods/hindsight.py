@@ -1,0 +1,68 @@
+"""Hindsight: is demodulation right here?
+
+Dividing by the reflectance helps where light is reflectance times irradiance. Where it is not (emission, overexposure,
+fog in front, sky) the quotient carries the texture's inverse, which moves with the surface like the texture itself, and
+is harmless while texels map to the same texels, but prints a texture where the division and the multiplication meet
+different ones. So both ways predict the newest rendered frame from the one before it, pixel by pixel; what was better
+there is carried along the motion to the target.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxtrapolate.gather import backward_warp, landing, sample
+from jaxtrapolate.methods.method import Stage, Values, rendered
+from jaxtrapolate.methods.stages import chain
+from jaxtrapolate.radiance import By, demodulate, modulate
+from jaxtrapolate.records import Frame
+
+_BLOCK = 8  # pixels, the side of the blocks over which errors are averaged
+
+
+def _blocks(image: Float[Array, "h w 1"]) -> Float[Array, "i j 1"]:
+    """Sums over blocks of pixels; those at the right and lower border may be smaller."""
+    height, width, _ = image.shape
+    padded = jnp.pad(image, ((0, -height % _BLOCK), (0, -width % _BLOCK), (0, 0)))
+    return padded.reshape(-(-height // _BLOCK), _BLOCK, -(-width // _BLOCK), _BLOCK).sum((1, 3))[..., None]
+
+
+def _display(color):
+    """A tone curve for comparing errors: sqrt(x / (1 + x)), which is near `tonemap` and cheaper."""
+    positive = jnp.where(color > 0, color, 1)
+    return jnp.where(color > 0, jnp.sqrt(positive / (1 + positive)), 0)
+
+
+@partial(jax.jit, static_argnames=("by",))
+def plain_share(newest: Frame, previous: Frame, motion: Float[Array, "h w 2"], *, by: By) -> Float[Array, "i j 1"]:
+    """How much of a prediction should come from the colour as it is, 0..1, for each block of 8 x 8 pixels of `newest`.
+
+    The squared errors of both predictions of `newest` from `previous`, tone mapped and summed over a block, say which
+    was better: share = b^2 / (a^2 + b^2), a the plain one's and b the demodulated one's.
+    """
+    truth = _display(newest.color)
+    plain = backward_warp(previous.color, motion)
+    demodulated = backward_warp(demodulate(previous.color, previous.gbuffer, by=by), motion)
+
+    def error(image):
+        difference = jnp.square(_display(image) - truth)
+        return _blocks(difference[..., :1] + difference[..., 1:2] + difference[..., 2:]) ** 2
+
+    a, b = error(plain), error(modulate(demodulated, newest.gbuffer, by=by))
+    return jnp.where(a + b > 0, b / jnp.where(a + b > 0, a + b, 1), 0)
+
+
+def hindsight_stage(by: By = "albedo+specular") -> Stage:
+    """Adds "plain_share" on the target's grid; 0 in "holes", where the plain warp shows another surface."""
+
+    def function(state, values: Values):
+        history, motion = values["history"], values["motion"]
+        newest, previous = rendered(history)[:2]
+        share = plain_share(history[newest], history[previous], chain(history, newest, previous), by=by)
+        x, y, _ = landing(motion)
+        carried = sample(share, (x + 0.5) / _BLOCK - 0.5, (y + 0.5) / _BLOCK - 0.5)
+        return {"plain_share": jnp.where(values["holes"], 0, carried)}
+
+    return Stage("hindsight", function, reads=("history.albedo", "target.albedo", "history.motion"), optional=True, past=2)

@@ -1,0 +1,96 @@
+"""Stages that several methods share.
+
+Values they pass on: "motion", from the target to the newest rendered frame, which is "newest"; "layer", the image that
+is warped (demodulated where that can be), and "warped", the warped one; "plain_share", where the plain warp is to be
+preferred, from `jaxtrapolate.methods.hindsight`; "holes", a bool mask; "image".
+"""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxtrapolate.checks import check_present
+from jaxtrapolate.gather import backward_warp, landing, pixel_grid
+from jaxtrapolate.holes import hole_masks
+from jaxtrapolate.methods.method import Stage, Values, rendered
+from jaxtrapolate.motion import chain_motion
+from jaxtrapolate.radiance import By, demodulate, modulate
+from jaxtrapolate.records import Frame, GBuffer
+
+
+def chain(frames: Sequence[Frame], first: int, last: int) -> Array:
+    """Motion from frames[first] to the older frames[last], through the motion of all frames between."""
+    total = None
+    for i in range(first, last, -1):
+        motion = frames[i].motion
+        check_present(f"frame {i - len(frames) + 1} before the target: motion", motion, needed_by="the chain of motion")
+        total = motion if total is None else chain_motion(total, motion)
+    return total
+
+
+def _reproject(state, values: Values):
+    history, target = values["history"], values["target"]
+    newest = rendered(history)[0]
+    return {"newest": history[newest], "motion": chain((*history, target), len(history), newest)}
+
+
+REPROJECT = Stage("reproject", _reproject, reads=("target.motion", "history.color"))
+"""Finds the newest rendered frame and the motion that leads there."""
+
+
+def demodulate_stage(by: By = "albedo+specular") -> Stage:
+    """Divides the newest frame by its reflectance; without albedo the colour is warped as it is."""
+
+    def function(state, values: Values):
+        newest = values["newest"]
+        return {"layer": demodulate(newest.color, newest.gbuffer, by=by)}
+
+    return Stage("demodulate", function, reads=("history.albedo", "target.albedo"), optional=True)
+
+
+def layer(values: Values) -> Array:
+    """What is to be warped: the demodulated colour, or the colour where that stage was left out."""
+    return values["layer"] if "layer" in values else values["newest"].color
+
+
+def modulate_stage(by: By = "albedo+specular") -> Stage:
+    """Multiplies by the target's reflectance, and takes the plain warp where hindsight prefers that."""
+
+    def function(state, values: Values):
+        image = modulate(values["warped"], values["target"].gbuffer, by=by)
+        if "plain_share" in values:
+            plain = backward_warp(values["newest"].color, values["motion"])
+            image = jnp.where(values["plain_share"] > 0, image + values["plain_share"] * (plain - image), image)
+        return {"image": image}
+
+    return Stage("modulate", function, reads=("history.albedo", "target.albedo"), optional=True)
+
+
+def _sky(state, values: Values):
+    buffers = values["target"].gbuffer
+    return {"image": jnp.where(buffers.sky > 0.5, buffers.sky_color, values["image"])}
+
+
+SKY = Stage("sky", _sky, reads=("target.sky", "target.sky_color"), optional=True)
+"""Takes the sky as the engine drew it for the target."""
+
+
+def find_holes(target: GBuffer | None, source: GBuffer | None, motion: Array) -> Array:
+    """The union `[H, W, 1]` of all hole masks that the buffers allow, of the pixel nearest to the landing place.
+
+    Judged by all four bilinear taps, every pixel beside a silhouette would be a hole as well.
+    """
+    x, y, finite = landing(motion)
+    column, row = pixel_grid(*motion.shape[:2], dtype=x.dtype)
+    nearest = jnp.stack([jnp.floor(x + 0.5) - column, jnp.floor(y + 0.5) - row], -1)
+    nearest = jnp.where(finite[..., None], nearest, jnp.nan)
+    return hole_masks(target or GBuffer(), source or GBuffer(), nearest).any
+
+
+def _holes(state, values: Values):
+    return {"holes": find_holes(values["target"].gbuffer, values["newest"].gbuffer, values["motion"])}
+
+
+HOLES = Stage("holes", _holes)
+"""Marks where the warped frame shows another surface; with no buffers at all, only what lies outside the frame."""

@@ -1,0 +1,268 @@
+"""The report's plots as SVG: error against run time, error by cause, error over the frames.
+
+Each is drawn with a transparent ground, and follows the viewer's light or dark theme by a style sheet of its own. Text
+is drawn as outlines, so that no font is needed; nothing of matplotlib's state is changed for the caller.
+"""
+
+import io
+import itertools
+import math
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.transforms import Bbox
+
+from jaxtrapolate.causes import CAUSES
+from jaxtrapolate.report.values import MethodResult, fixed, percent, read_methods
+
+_INK, _SOFT, _GRID = "#24292e", "#59616a", "#d5d9dd"
+_DARK = {_INK: "#e8ebee", _SOFT: "#a5adb6", _GRID: "#3a4149"}
+_FONT = "DejaVu Sans"
+_WIDTH = 5.4
+_LOCK = threading.Lock()
+
+
+def _style_sheet() -> str:
+    rules = [f'[style*="{kind}: {a}"]{{{kind}:{b}!important}}' for a, b in _DARK.items() for kind in ("fill", "stroke")]
+    return f"<style>@media (prefers-color-scheme:dark){{{''.join(rules)}}}</style>"
+
+
+def _svg(figure: Figure) -> bytes:
+    """The figure as a stand-alone SVG, the same bytes for the same figure."""
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"svg.fonttype": "path", "svg.hashsalt": "jaxtrapolate"}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue().decode()
+    start = text.index(">", text.index("<svg ")) + 1
+    return (text[:start] + _style_sheet() + text[start:]).encode()
+
+
+def _drawable(text: str, limit: int = 26) -> str:
+    """The text as the font can draw it: without line breaks and unknown signs, and not longer than `limit`."""
+    font = get_font(findfont(FontProperties(family=_FONT)))
+    text = "".join(c if font.get_char_index(ord(c)) else "?" for c in " ".join(text.split()))
+    return text if len(text) <= limit else text[: limit - 1] + "…"
+
+
+def _axes(height: float) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.grid(True, color=_GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=_INK, labelsize=10, length=0)
+    axes.tick_params(which="minor", length=0)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(_SOFT)
+    return figure, axes
+
+
+def _labels(axes: Any, x: str, y: str) -> None:
+    axes.set_xlabel(x, color=_INK, fontsize=10.5)
+    axes.set_ylabel(y, color=_INK, fontsize=10.5)
+
+
+def _nothing(figure: Figure, axes: Any, text: str) -> bytes:
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, text, color=_SOFT, fontsize=11, ha="center", va="center", transform=axes.transAxes)
+    return _svg(figure)
+
+
+def _legend(figure: Figure, methods: Sequence[MethodResult], *, line: str) -> None:
+    """One entry a method above the axes. Names may hold any sign, so the labels are set afterwards, as plain text."""
+    handles = [Line2D([], [], color=m.color, marker=m.marker, markersize=6, linestyle=line) for m in methods]
+    fitting = max(1, int(66 / (max(len(_drawable(m.name)) for m in methods) + 5)))
+    columns = math.ceil(len(methods) / math.ceil(len(methods) / fitting))
+    legend = figure.legend(
+        handles, ["?"] * len(handles), loc="outside upper left", ncols=columns, frameon=False, fontsize=9.5
+    )
+    for text, method in zip(legend.get_texts(), methods, strict=True):
+        text.set(text=_drawable(method.name), color=_INK, parse_math=False)
+
+
+def _ceiling(values: Sequence[float]) -> tuple[list[float], float | None]:
+    """The values with infinite ones put above the finite ones, and the height of those, None where there are none."""
+    finite = [v for v in values if math.isfinite(v)]
+    low, high = (min(finite), max(finite)) if finite else (0.0, 40.0)
+    top = high + max(1.0, 0.2 * (high - low))
+    lowest = low - max(1.0, 0.2 * (high - low))
+    placed = [v if math.isfinite(v) else top if v > 0 else lowest for v in values]
+    return placed, top if any(v == math.inf for v in values) else None
+
+
+def _pareto(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The points for which no other is at most as slow and at least as good, in the order of time."""
+    front: list[tuple[float, float]] = []
+    for x, y in sorted(points, key=lambda p: (p[0], -p[1])):
+        if not front or y > front[-1][1]:
+            front.append((x, y))
+    return front
+
+
+def _place_labels(
+    figure: Figure,
+    axes: Any,
+    points: Sequence[tuple[float, float]],
+    texts: Sequence[str],
+    stairs: Sequence[tuple[float, float]],
+) -> None:
+    """A label beside each point, on the side where it covers least of other points and labels and of the stairs."""
+    renderer = figure.canvas.get_renderer()
+    figure.draw_without_rendering()
+    inner = axes.get_window_extent(renderer)
+    centers = [axes.transData.transform(point) for point in points]
+    taken = [Bbox.from_bounds(x - 7, y - 7, 14, 14) for x, y in centers]
+    corners_of_stairs = axes.transData.transform(stairs)
+    lines = []
+    for (left, low), (right, high) in itertools.pairwise(corners_of_stairs):
+        lines += [Bbox([[left, low - 2], [right, low + 2]]), Bbox([[right - 2, low], [right + 2, high]])]
+    sides = ((9, 0, "left", "center"), (-9, 0, "right", "center"), (0, 9, "center", "bottom"), (0, -9, "center", "top"))
+    corners = ((7, 7, "left", "bottom"), (7, -7, "left", "top"), (-7, 7, "right", "bottom"), (-7, -7, "right", "top"))
+    for index, (point, text) in enumerate(zip(points, texts, strict=True)):
+        best = None
+        for order, (dx, dy, horizontal, vertical) in enumerate(sides + corners):
+            label = axes.annotate(
+                text, point, (dx, dy), textcoords="offset points", color=_INK, fontsize=10, ha=horizontal, va=vertical
+            )
+            label.set(parse_math=False, in_layout=False)
+            box = label.get_window_extent(renderer)
+            outside = box.width * box.height - _overlap(box, inner)
+            covered = sum(_overlap(box, other) for i, other in enumerate(taken) if i != index)
+            cost = covered + 2 * outside + sum(_overlap(box, line) for line in lines) + 1e-3 * order
+            if best is None or cost < best[0]:
+                if best is not None:
+                    best[1].remove()
+                best = (cost, label, box)
+            else:
+                label.remove()
+        taken.append(best[2])
+
+
+def _overlap(first: Bbox, second: Bbox) -> float:
+    common = Bbox.intersection(first, second)
+    return 0.0 if common is None else common.width * common.height
+
+
+def _isolated(function: Any, *arguments: Any) -> bytes:
+    """A drawing under matplotlib's own defaults, whatever the caller's settings are, which stay as they were."""
+    with _LOCK, matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        return function(*arguments)
+
+
+def plot_error_time(results: Mapping[str, Any]) -> bytes:
+    """dB against milliseconds a frame (logarithmic), a labelled point for each method, and the Pareto front.
+
+    On the front are the methods that no other beats in both. Infinite dB are drawn above the others and labelled so;
+    methods without dB or time are not drawn.
+
+    Returns:
+        SVG, UTF-8.
+    """
+    return _isolated(_error_time, read_methods(results))
+
+
+def _error_time(methods: Sequence[MethodResult]) -> bytes:
+    figure, axes = _axes(3.6)
+    drawn = [m for m in methods if m.psnr is not None and m.ms.median]
+    if not drawn:
+        return _nothing(figure, axes, "no method with both dB and run time")
+    heights, _ = _ceiling([m.psnr for m in drawn])
+    times = [m.ms.median for m in drawn]
+    points = list(zip(times, heights, strict=True))
+    span = max(max(heights) - min(heights), 1.0)
+    low, high = min(times), max(times)
+    widen = max((high / low) ** 0.18, 1.6)
+    axes.set_xscale("log")
+    axes.set_xlim(low / widen, high * widen)
+    axes.set_ylim(min(heights) - 0.18 * span, max(heights) + 0.18 * span)
+    front = _pareto(points)
+    stairs = [*front, (high * widen, front[-1][1])]
+    axes.plot(*zip(*stairs, strict=True), drawstyle="steps-post", color=_SOFT, linewidth=1.3, dashes=(4, 3), zorder=2)
+    for method, (x, y) in zip(drawn, points, strict=True):
+        axes.plot([x], [y], marker=method.marker, color=method.color, markersize=9, linestyle="none", zorder=3)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / low < 300 else (1,)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+    _labels(axes, "milliseconds a frame (median, log)", "PSNR, dB")
+    texts = [_drawable(m.name) + (f" ({fixed(m.psnr)} dB)" if math.isinf(m.psnr) else "") for m in drawn]
+    axes.text(0.995, 0.015, "dashed: Pareto front", color=_SOFT, fontsize=8.5, ha="right", transform=axes.transAxes)
+    _place_labels(figure, axes, points, texts, stairs)
+    return _svg(figure)
+
+
+def plot_causes(results: Mapping[str, Any]) -> bytes:
+    """dB by cause: a row for each cause that occurs, with its share of the pixels, and a mark for each method.
+
+    Returns:
+        SVG, UTF-8.
+    """
+    return _isolated(_causes, read_methods(results))
+
+
+def _causes(methods: Sequence[MethodResult]) -> bytes:
+    drawn = [m for m in methods if any(value is not None for value, _ in m.by_cause.values())]
+    causes = [c for c in CAUSES if any(m.by_cause.get(c, (None,))[0] is not None for m in drawn)]
+    if not causes:
+        return _nothing(*_axes(1.6), "no dB by cause")
+    figure, axes = _axes(0.42 * len(causes) + 1.0 + 0.12 * len(drawn))
+    placed, top = _ceiling([v for m in drawn for c in causes if (v := m.by_cause.get(c, (None,))[0]) is not None])
+    heights = iter(placed)
+    marks = {(m.name, c): next(heights) for m in drawn for c in causes if m.by_cause.get(c, (None,))[0] is not None}
+    for row, cause in enumerate(causes):
+        found = [marks[m.name, cause] for m in drawn if (m.name, cause) in marks]
+        axes.plot([min(found), max(found)], [row, row], color=_SOFT, linewidth=1.2, zorder=2)
+    for index, method in enumerate(drawn):
+        rows = [row for row, cause in enumerate(causes) if (method.name, cause) in marks]
+        values = [marks[method.name, causes[row]] for row in rows]
+        axes.plot(
+            values, rows, marker=method.marker, color=method.color, markersize=8, linestyle="none", zorder=3 + index
+        )
+    names = []
+    for cause in causes:
+        shares = [s for m in drawn if (s := m.by_cause.get(cause, (None, None))[1]) is not None]
+        names.append(f"{cause}, {percent(shares[0])}" if shares else cause)
+    axes.set_yticks(range(len(causes)), names)
+    axes.set_ylim(len(causes) - 0.5, -0.5)
+    axes.grid(False, axis="y")
+    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+    _labels(axes, "PSNR, dB" + ("" if top is None else " (rightmost: infinite)"), "")
+    _legend(figure, drawn, line="none")
+    return _svg(figure)
+
+
+def plot_frames(results: Mapping[str, Any]) -> bytes:
+    """dB over the scored frames, a line for each method; a gap where a frame has none.
+
+    Returns:
+        SVG, UTF-8.
+    """
+    return _isolated(_frames, read_methods(results))
+
+
+def _frames(methods: Sequence[MethodResult]) -> bytes:
+    figure, axes = _axes(3.4)
+    drawn = [m for m in methods if any(f.psnr is not None for f in m.frames)]
+    if not drawn:
+        return _nothing(figure, axes, "no dB by frame")
+    placed, top = _ceiling([f.psnr for m in drawn for f in m.frames if f.psnr is not None])
+    heights = iter(placed)
+    for method in drawn:
+        values = [math.nan if f.psnr is None else next(heights) for f in method.frames]
+        size = 6 if len(values) <= 30 else 0
+        numbers = [f.number for f in method.frames]
+        axes.plot(numbers, values, color=method.color, marker=method.marker, markersize=size, linewidth=1.8)
+    axes.xaxis.set_major_locator(MaxNLocator(8, integer=True, min_n_ticks=1))
+    axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+    _labels(axes, "frame", "PSNR, dB" + ("" if top is None else " (top: infinite)"))
+    _legend(figure, drawn, line="-")
+    return _svg(figure)

@@ -1,0 +1,71 @@
+"""A scene as a `Sequence`, the interface that commands and methods read."""
+
+import jax
+import numpy as np
+
+from jaxtrapolate.files.sequence import MotionConvention, Sequence
+from jaxtrapolate.records import Frame, Keyframe
+from jaxtrapolate.scenes.library import scene
+from jaxtrapolate.scenes.render import keyframe, render, visible
+
+
+class SceneSequence(Sequence):
+    """Frames first, first + 1, ... of an embedded scene, rendered when asked for.
+
+    Args:
+        name: of the scene; see `scene_names`.
+        seed: see `scene`.
+        frames: how many.
+        size: `(H, W)`.
+        first: number and time of the first frame.
+        samples: colour samples a pixel.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        seed: int = 0,
+        frames: int = 60,
+        size: tuple[int, int] = (180, 320),
+        *,
+        first: int = 0,
+        samples: int = 1,
+    ) -> None:
+        if frames < 1:
+            raise ValueError(f"frames: expected at least 1, got {frames}")
+        self.scene = scene(name, seed)
+        self.name = f"{name}-{seed}"
+        self.numbers = tuple(range(first, first + frames))
+        self.size = (int(size[0]), int(size[1]))
+        self.hdr = True
+        self.convention = MotionConvention()
+        self.depth = "metric"
+        self.forward_motion = True
+        self.samples = samples
+
+    def frame(self, number: int) -> Frame:
+        """The frame with every buffer."""
+        self._check(number)
+        return _arrays(render(self.scene, float(number), size=self.size, samples=self.samples))
+
+    def stored_motion(self, number: int) -> np.ndarray:
+        """The frame's motion, which is in the library's own convention."""
+        return np.asarray(self.frame(number).motion)
+
+    def keyframe(self, number: int) -> Keyframe:
+        """The frame with its exact flows to the frames after and before it."""
+        self._check(number)
+        time = float(number)
+        return _arrays(keyframe(self.scene, time, size=self.size, next_time=time + 1, previous_time=time - 1))
+
+    def visible(self, number: int, other: int) -> np.ndarray:
+        """The exact `visible`, bool `[H, W]`, from one frame to another."""
+        return np.asarray(visible(self.scene, float(number), float(other), size=self.size))
+
+    def _check(self, number: int) -> None:
+        if number not in self.numbers:
+            raise ValueError(f"number: expected {self.numbers[0]} to {self.numbers[-1]}, got {number}")
+
+
+def _arrays(value: Frame | Keyframe) -> Frame | Keyframe:
+    return jax.tree.map(np.asarray, value)  # type: ignore[return-value]

@@ -1,0 +1,63 @@
+"""What all tests share: annotations checked at run time, strict promotion, float64, and the folder of large data."""
+
+import os
+
+import jaxtyping
+import pytest
+
+CHECKED = os.environ.get("JAXTRAPOLATE_TYPECHECK", "1") != "0"
+
+
+def check_annotations(function):
+    """beartype on every function of the library, except what builds a record: transformations put other leaves there."""
+    from beartype import beartype
+
+    return function if function.__name__ == "__init__" else beartype(function)
+
+
+if CHECKED:
+    jaxtyping.install_import_hook("jaxtrapolate", "conftest.check_annotations")
+
+import jax  # noqa: E402  the hook comes before all that may import the library
+
+
+@pytest.fixture(scope="session")
+def typechecked():
+    """Skip where the annotations are not checked."""
+    if not CHECKED:
+        pytest.skip("JAXTRAPOLATE_TYPECHECK=0")
+
+
+@pytest.fixture
+def unchecked():
+    """Without the type checker: the library's own errors are seen, and NumPy arrays are taken as users may pass them."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(scope="module")
+def strict():
+    """No implicit promotion of dtypes or ranks, in the library and in the test."""
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        yield
+
+
+@pytest.fixture
+def x64():
+    """64-bit types, for comparisons and gradient checks in float64."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="session")
+def data():
+    """The folder of large data, which JAXTRAPOLATE_DATA names."""
+    from pathlib import Path
+
+    folder = os.environ.get("JAXTRAPOLATE_DATA")
+    if not folder:
+        pytest.skip("JAXTRAPOLATE_DATA is not set")
+    path = Path(folder)
+    assert path.is_dir(), f"JAXTRAPOLATE_DATA={folder} is not a folder"
+    return path
