@@ -2,8 +2,8 @@
 
 Equal footing: a peer gets the same float32 arrays in its own library's layout, makes what it derives from them (maps,
 grids, coordinates) within the timed call, and allocates its result there, as ours do. The peers need not treat NaN. The
-loops are compiled without fastmath, which gained nothing when tried; those over target pixels run in
-parallel where the benchmark uses all cores, those that scatter are sequential, because their order matters.
+loops are compiled without fastmath, which gained nothing when tried; those over target pixels run in parallel where the
+benchmark uses all cores, those that scatter are sequential, because their order matters.
 """
 
 import importlib

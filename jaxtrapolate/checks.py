@@ -6,9 +6,13 @@ They read shapes and dtypes only, so they run at trace time, once per compilatio
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 Size = tuple[int, int]
+ArrayLike = jax.Array | np.ndarray
+"""What public functions take for an array; they return JAX arrays."""
 
 
 def check_array(name: str, value: Any, *, shape: Sequence[int | str]) -> tuple[int, ...]:

@@ -11,9 +11,9 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
-from jaxtrapolate.checks import check_choice, check_image
+from jaxtrapolate.checks import ArrayLike, check_choice, check_image
 
 Filter = Literal["nearest", "bilinear", "bicubic"]
 
@@ -55,7 +55,7 @@ def cell(x: Float[Array, "*n"], size: int) -> tuple[Array, Array]:
     return lower, held - lower.astype(held.dtype)
 
 
-def take_rows(rows: Float[Array, "n c"], index: Array) -> Array:
+def take_rows(rows: Shaped[Array, "n c"], index: Array) -> Array:
     """rows[index], for indices that are known to be in bounds."""
     dimensions = jax.lax.GatherDimensionNumbers(
         offset_dims=(index.ndim,), collapsed_slice_dims=(0,), start_index_map=(0,)
@@ -182,15 +182,16 @@ def _backward_warp(image, motion, value, *, filter, fill):
         seen = finite & inside(x, y, *image.shape[:2])
         return jnp.where(seen[..., None], warped, value.astype(image.dtype))
 
-    return where_finite(warp, image, motion)
+    # a nearest pixel is taken whole, without a product
+    return warp(None, image, motion) if filter == "nearest" else where_finite(warp, image, motion)
 
 
 def backward_warp(
-    image: Float[Array, "h w c"],
-    motion: Float[Array, "i j 2"],
+    image: Float[ArrayLike, "h w c"],
+    motion: Float[ArrayLike, "i j 2"],
     *,
     filter: Filter = "bilinear",
-    outside: Literal["edge", "zero"] | float | Float[Array, ""] = "edge",
+    outside: Literal["edge", "zero"] | float | Float[ArrayLike, ""] = "edge",
 ) -> Float[Array, "i j c"]:
     """The image fetched along the motion: result[p] = image(p + motion[p]).
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt32
 
-from jaxtrapolate.checks import check_choice, check_image
+from jaxtrapolate.checks import ArrayLike, check_choice, check_image
 from jaxtrapolate.gather import landing, take_rows, weigh
 
 Guides = Literal["float32", "packed"]
@@ -107,7 +107,7 @@ def _blend(code, x, y, image, target, source, smaller, guide_factor, space_facto
         for k in range(source.shape[-1]):
             theirs = take_rows(rows[:, k : k + 1], index)[..., 0]
             squared = squared + jnp.square(jnp.where(used, target[..., k] - theirs, 0))
-        apart = jnp.square(x - tap_column) + jnp.square(y - tap_row)
+        apart = jnp.where(used, jnp.square(x - tap_column) + jnp.square(y - tap_row), 0)  # may be infinite where unused
         return jnp.where(used, guide_factor * squared + space_factor * apart, jnp.inf)
 
     slots = 6 * jnp.arange(keep, dtype=jnp.uint32)
@@ -173,14 +173,14 @@ def _guided_warp(image, motion, target, source, sigma_guide, sigma_space, *, str
 
 
 def guided_warp(
-    image: Float[Array, "h w c"],
-    motion: Float[Array, "h w 2"],
-    target_guide: Float[Array, "h w g"],
-    source_guide: Float[Array, "h w g"],
+    image: Float[ArrayLike, "h w c"],
+    motion: Float[ArrayLike, "h w 2"],
+    target_guide: Float[ArrayLike, "h w g"],
+    source_guide: Float[ArrayLike, "h w g"],
     *,
     strides: Sequence[int] = (1, 3, 5, 9),
-    sigma_guide: float | Float[Array, ""] = 0.05,
-    sigma_space: float | Float[Array, ""] = 0.5,
+    sigma_guide: float | Float[ArrayLike, ""] = 0.05,
+    sigma_space: float | Float[ArrayLike, ""] = 0.5,
     keep: int = 4,
     guides: Guides = "float32",
 ) -> Float[Array, "h w c"]:
@@ -197,8 +197,8 @@ def guided_warp(
         sigma_guide: in units of the guides. sigma_space: in pixels. Both > 0; traced, so that they can be fitted.
         keep: how many taps are blended, 1 to 5.
         guides: "float32", or "packed": the ranking of the taps compares guides rounded to float16 (of up to 65504) and
-            reads half the memory. The weights of the taps that were picked are exact in both. See the README for its
-            error and speed.
+            reads half the memory; whether that is faster depends on the machine. The weights of the taps that were
+            picked are exact in both. See the README for its error and speed.
 
     Returns:
         `[H, W, C]` of the dtype of `image`. Blended in at least float32.

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxtrapolate.checks import check_choice, check_image
+from jaxtrapolate.checks import ArrayLike, check_choice, check_image
 from jaxtrapolate.gather import backward_warp, cell, inside, landing, sample, take_offsets
 from jaxtrapolate.records import GBuffer, check_gbuffer, record
 
@@ -168,12 +168,12 @@ _RELEASE = (7.5, 45.0, 0.005)  # centimetres
 def hole_masks(
     target: GBuffer,
     source: GBuffer,
-    motion: Float[Array, "h w 2"],
+    motion: Float[ArrayLike, "h w 2"],
     *,
     taps: Taps = "weighted",
-    softness: float | Float[Array, ""] = 0.0,
-    normal_threshold: float | Float[Array, ""] = 0.98,
-    position_threshold: float | Float[Array, ""] | tuple[float, float, float] | None = None,
+    softness: float | Float[ArrayLike, ""] = 0.0,
+    normal_threshold: float | Float[ArrayLike, ""] = 0.98,
+    position_threshold: float | Float[ArrayLike, ""] | tuple[float, float, float] | None = None,
 ) -> HoleMasks:
     """Where a frame warped along `motion` shows another surface than the target.
 

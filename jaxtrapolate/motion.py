@@ -43,6 +43,9 @@ def chain_motion(newer: Float[Array, "h w 2"], older: Float[Array, "h w 2"]) -> 
     Gradient:
         With respect to both, as of `backward_warp`.
 
+    Raises:
+        TypeError, ValueError: no floating-point array, or shapes that do not fit.
+
     References:
         Guo et al. 2021 (ExtraNet), section 4.4 ("we simply accumulate the motion vectors").
     """
@@ -66,6 +69,9 @@ def convert_motion(
 
     Returns:
         `[H, W, 2]` pixels to add, x right, y down.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, a shape that does not fit, an option that is not listed.
 
     References:
         Convention of Unreal's dumps: current_minus_previous, pixels, up. Chen 2021 (notes on ExtraNet), section 2.1,
@@ -119,6 +125,10 @@ def camera_motion(
     Gradient:
         With respect to position, both cameras and the matrices; 0 where the result is NaN.
 
+    Raises:
+        TypeError, ValueError: no floating-point array, a shape that does not fit, a camera without a matrix, or one of
+            object_motion and stencil without the other.
+
     References:
         Chen 2021 (notes on ExtraNet), section 2.1, which prints P M V s for P V M s; its velocity is current minus
         previous in fractions of the frame with y up: ours = (-W v_x, +H v_y).
@@ -162,6 +172,9 @@ def occlusion_motion(motion: Float[Array, "h w 2"], depth: Float[Array, "h w 1"]
     Gradient:
         With respect to the values of the motion that is picked; none with respect to where it lands, nor to depth.
 
+    Raises:
+        TypeError, ValueError: no floating-point array, or shapes that do not fit.
+
     References:
         Zeng et al. 2021; Guo et al. 2021 (ExtraNet), section 4.2, in the form of the authors' release.
     """
@@ -203,6 +216,9 @@ def dilate_motion(
 
     Gradient:
         With respect to the motion that is picked; none with respect to depth.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, shapes that do not fit, or an unknown `neighbours`.
 
     References:
         Karis 2014; Yang et al. 2020, section 4.2.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrapolate.checks import check_choice, check_image, check_present
+from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_present
 from jaxtrapolate.gather import landing, take_rows, weigh
 
 Mode = Literal["sum", "average", "linear", "softmax"]
@@ -69,9 +69,9 @@ def _splat_nearest(values, motion, depth, *, footprint):
 
 
 def splat_nearest(
-    values: Float[Array, "h w c"],
-    motion: Float[Array, "h w 2"],
-    depth: Float[Array, "h w 1"],
+    values: Float[ArrayLike, "h w c"],
+    motion: Float[ArrayLike, "h w 2"],
+    depth: Float[ArrayLike, "h w 1"],
     *,
     footprint: Literal[1, 4] = 4,
 ) -> tuple[Float[Array, "h w c"], Bool[Array, "h w"]]:
@@ -163,10 +163,10 @@ def _splat(values, motion, weights, *, mode):
 
 
 def splat(
-    values: Float[Array, "h w c"],
-    motion: Float[Array, "h w 2"],
+    values: Float[ArrayLike, "h w c"],
+    motion: Float[ArrayLike, "h w 2"],
     *,
-    weights: Float[Array, "h w 1"] | None = None,
+    weights: Float[ArrayLike, "h w 1"] | None = None,
     mode: Mode = "average",
 ) -> Float[Array, "h w c"]:
     """Bilinear forward splatting: each pixel's value is shared among the four pixels around p + motion[p].

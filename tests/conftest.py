@@ -9,7 +9,7 @@ CHECKED = os.environ.get("JAXTRAPOLATE_TYPECHECK", "1") != "0"
 
 
 def check_annotations(function):
-    """beartype on every function of the library, except what builds a record: transformations put other leaves there."""
+    """beartype on every function of the library but those that build a record, where transformations put any leaf."""
     from beartype import beartype
 
     return function if function.__name__ == "__init__" else beartype(function)
@@ -30,7 +30,7 @@ def typechecked():
 
 @pytest.fixture
 def unchecked():
-    """Without the type checker: the library's own errors are seen, and NumPy arrays are taken as users may pass them."""
+    """Without the type checker: the library's own errors are seen, and NumPy arrays are taken."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
@@ -46,7 +46,7 @@ def strict():
 @pytest.fixture
 def x64():
     """64-bit types, for comparisons and gradient checks in float64."""
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):  # strict, float64 and float32 have no common type
         yield
 
 

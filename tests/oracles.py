@@ -16,7 +16,7 @@ def random(*shape, seed=0, low=0.0, high=1.0, dtype=np.float32):
 
 
 def random_motion(height, width, *, seed=1, amount=2, kinks=False, dtype=np.float32):
-    """Random whole pixels up to `amount` and, unless `kinks`, a fraction in 0.2..0.8: away from where derivatives jump."""
+    """Whole pixels up to `amount` and, unless `kinks`, a fraction in 0.2..0.8: away from where derivatives jump."""
     rng = np.random.default_rng(seed)
     whole = rng.integers(-amount, amount + 1, (height, width, 2))
     fraction = 0 if kinks else rng.uniform(0.2, 0.8, (height, width, 2))
@@ -105,7 +105,7 @@ def shift(image, dx, dy, fill=None):
     out = np.empty_like(image)
     for r, c in np.ndindex(height, width):
         j, i = r + dy, c + dx
-        if 0 <= j < height and 0 <= i < width or fill is None:
+        if (0 <= j < height and 0 <= i < width) or fill is None:
             out[r, c] = image[min(max(j, 0), height - 1), min(max(i, 0), width - 1)]
         else:
             out[r, c] = fill
@@ -163,8 +163,8 @@ def chain_motion(newer, older):
 
 
 def project(view, projection, point, height, width):
-    """Pixel position of one world point, None behind the camera."""
-    clip = np.float64(projection) @ np.float64(view) @ np.append(np.float64(point), 1.0)
+    """Pixel position of one homogeneous world point, None behind the camera."""
+    clip = np.float64(projection) @ np.float64(view) @ point
     if not clip[3] > 0:
         return None
     x, y = clip[:2] / clip[3]
@@ -176,12 +176,12 @@ def camera_motion(position, camera, previous, object_motion=None, stencil=None):
     height, width, _ = position.shape
     out = np.full((height, width, 2), np.nan)
     for r, c in np.ndindex(height, width):
-        point = np.float64(position[r, c])
+        point = np.append(np.float64(position[r, c]), 1.0)
         if not np.isfinite(point).all():
             continue
         before = point
         if stencil is not None and 0 <= round(float(stencil[r, c, 0])) < len(object_motion):
-            before = (np.float64(object_motion[round(float(stencil[r, c, 0]))]) @ np.append(point, 1.0))[:3]
+            before = np.float64(object_motion[round(float(stencil[r, c, 0]))]) @ point
         here, there = project(*camera, point, height, width), project(*previous, before, height, width)
         if here is not None and there is not None:
             out[r, c] = there - here
@@ -230,7 +230,7 @@ def guided_offsets(strides):
     return out
 
 
-def guided_warp(image, motion, target, source, strides=(1, 3, 5, 9), sigma_guide=0.05, sigma_space=1.0, keep=4):
+def guided_warp(image, motion, target, source, strides=(1, 3, 5, 9), sigma_guide=0.05, sigma_space=0.5, keep=4):
     """The result, and by how much the last kept cost differs from the first that is not, relative to it."""
     image, target, source = (np.asarray(a, np.float64) for a in (image, target, source))
     height, width, _ = image.shape
@@ -253,17 +253,18 @@ def guided_warp(image, motion, target, source, strides=(1, 3, 5, 9), sigma_guide
         if len(taps) > keep:
             gap[r, c] = (taps[keep][0] - taps[keep - 1][0]) / max(taps[keep][0], 1e-300)
         weights = [np.exp(kept[0][0] - cost) for cost, _, _ in kept]
-        out[r, c] = sum(w * v for w, (_, _, v) in zip(weights, kept)) / sum(weights)
+        out[r, c] = sum(w * v for w, (_, _, v) in zip(weights, kept, strict=True)) / sum(weights)
     return out, gap
 
 
-def numeric_gradient(function, value, step=1e-6):
-    """Central differences of a scalar function of one float64 array."""
-    value = np.array(value, np.float64)
-    out = np.zeros_like(value)
-    for index in np.ndindex(value.shape):
-        up, down = value.copy(), value.copy()
-        up[index] += step
-        down[index] -= step
-        out[index] = (float(function(up)) - float(function(down))) / (2 * step)
-    return out
+def assert_gradients(function, arguments, gradients, *, step=1e-6, rtol=1e-5, atol=1e-7, directions=3, seed=7):
+    """The gradients of a scalar NumPy function, against its central differences along random directions."""
+    rng = np.random.default_rng(seed)
+    for k, (argument, gradient) in enumerate(zip(arguments, gradients, strict=True)):
+        assert np.shape(gradient) == np.shape(argument)
+        for _ in range(directions):
+            along = rng.uniform(-1, 1, np.shape(argument))
+            up, down = list(arguments), list(arguments)
+            up[k], down[k] = argument + step * along, argument - step * along
+            expected = (function(*up) - function(*down)) / (2 * step)
+            np.testing.assert_allclose(np.sum(gradient * along), expected, rtol, atol, err_msg=f"argument {k}")

@@ -1,26 +1,25 @@
 """backward_warp, in_frame: exact where they can be, against loops and other packages elsewhere, and their gradients."""
 
+import functools
 import warnings
 
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracles
 import pytest
 import scipy.ndimage
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from jax.test_util import check_grads
+from oracles import SIZES, inner_motion, random, random_motion
 
 import jaxtrapolate as jx
-import oracles
-from oracles import SIZES, inner_motion, random, random_motion
 
 pytestmark = pytest.mark.usefixtures("strict")
 
 FILTERS = ["nearest", "bilinear", "bicubic"]
-OUTSIDES = ["edge", "zero", 0.25]
 property_test = settings(max_examples=40, deadline=None, derandomize=True)
 
 
@@ -31,14 +30,14 @@ def warp(image, motion, **options):
 @pytest.mark.parametrize("filter", FILTERS)
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_identity_is_bit_exact(size, filter):
-    image = random(*size, 3, low=-3, high=3)
+    image = random(*size, 2, low=-3, high=3)
     np.testing.assert_array_equal(warp(image, np.zeros((*size, 2), np.float32), filter=filter), image)
 
 
 @pytest.mark.parametrize("filter", FILTERS)
 @pytest.mark.parametrize("dx, dy", [(1, 0), (0, -1), (-2, 1), (2, 2), (9, -8)])
 def test_whole_pixels_are_exact(filter, dx, dy):
-    image = random(5, 7, 3, low=-3, high=3)
+    image = random(5, 7, 2, low=-3, high=3)
     motion = np.full((5, 7, 2), (dx, dy), np.float32)
     np.testing.assert_array_equal(warp(image, motion, filter=filter), oracles.shift(image, dx, dy))
     for outside, value in (("zero", 0.0), (0.25, 0.25)):
@@ -46,9 +45,10 @@ def test_whole_pixels_are_exact(filter, dx, dy):
         np.testing.assert_array_equal(warp(image, motion, filter=filter, outside=outside), expected)
 
 
-@pytest.mark.parametrize("outside", OUTSIDES)
 @pytest.mark.parametrize("filter", FILTERS)
-@pytest.mark.parametrize("size", SIZES, ids=str)
+@pytest.mark.parametrize(
+    "size, outside", [(size, "edge") for size in SIZES] + [((5, 7), "zero"), ((5, 7), 0.25)], ids=str
+)
 def test_against_the_loop(size, filter, outside):
     image = random(*size, 2, low=-1)
     motion = random_motion(*size, amount=3)
@@ -56,20 +56,11 @@ def test_against_the_loop(size, filter, outside):
     np.testing.assert_allclose(result, oracles.backward_warp(image, motion, filter, outside), atol=2e-6)
 
 
-@pytest.mark.parametrize("filter", FILTERS)
-def test_against_the_loop_in_float64(x64, filter):
-    image, motion = random(5, 7, 2, dtype=np.float64), random_motion(5, 7, amount=3, dtype=np.float64)
-    result = warp(image, motion, filter=filter)
-    assert result.dtype == np.float64
-    np.testing.assert_allclose(result, oracles.backward_warp(image, motion, filter), rtol=1e-12)
-
-
-@pytest.mark.parametrize("filter", FILTERS)
-@pytest.mark.parametrize("outside", ["edge", 2.0])
+@pytest.mark.parametrize("filter, outside", [("nearest", "edge"), ("bilinear", "edge"), ("bilinear", 2.0)])
 def test_motion_of_another_size(filter, outside):
-    image, motion = random(5, 7, 3), random_motion(4, 9, amount=3)
+    image, motion = random(5, 7, 2), random_motion(4, 9, amount=3)
     result = warp(image, motion, filter=filter, outside=outside)
-    assert result.shape == (4, 9, 3)
+    assert result.shape == (4, 9, 2)
     np.testing.assert_allclose(result, oracles.backward_warp(image, motion, filter, outside), atol=2e-6)
 
 
@@ -140,16 +131,16 @@ def test_in_frame_against_the_loop(size):
 
 
 @pytest.mark.parametrize("filter", FILTERS)
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e6, -1e6, 1e30, -1e30, 3.4e38])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e6, -1e30, 3.4e38])
 def test_extreme_motion(filter, bad):
-    image = random(5, 7, 3)
+    image = random(5, 7, 2)
     motion = np.zeros((5, 7, 2), np.float32)
     motion[1, 2] = (bad, 0)
     motion[3, 4] = (0, bad)
     edge, zero = (warp(image, motion, filter=filter, outside=o) for o in ("edge", "zero"))
     np.testing.assert_allclose(edge, oracles.backward_warp(image, motion, filter), atol=1e-6)
-    np.testing.assert_array_equal(zero[1, 2], np.zeros(3))
-    np.testing.assert_array_equal(zero[3, 4], np.zeros(3))
+    np.testing.assert_array_equal(zero[1, 2], np.zeros(2))
+    np.testing.assert_array_equal(zero[3, 4], np.zeros(2))
     if not np.isfinite(bad):
         np.testing.assert_array_equal(edge[1, 2], image[1, 2])
     assert np.isfinite(edge).all()
@@ -178,27 +169,34 @@ def test_a_bad_pixel_does_not_spread(filter, bad):
         assert touched.sum() <= {"nearest": 1, "bilinear": 2, "bicubic": 4}[filter]
 
 
-@pytest.mark.parametrize("filter", FILTERS)
-@pytest.mark.parametrize("kind", ["float16", "bfloat16", "float32", "float64"])
-@pytest.mark.parametrize("motion_kind", ["float16", "float32"])
+@pytest.mark.parametrize(
+    "filter, kind, motion_kind",
+    [
+        ("bilinear", "float16", "float32"),
+        ("bilinear", "bfloat16", "bfloat16"),
+        ("bilinear", "float32", "float16"),
+        ("bilinear", "float32", "float64"),
+        ("bilinear", "float64", "float32"),
+        ("nearest", "bfloat16", "float16"),
+        ("bicubic", "bfloat16", "bfloat16"),
+    ],
+)
 def test_dtypes(x64, filter, kind, motion_kind):
-    image = jnp.asarray(random(5, 300, 1), kind)
-    motion = jnp.asarray(random_motion(5, 300, amount=3), motion_kind)
-    with jax.numpy_dtype_promotion("standard"):
-        result = jx.backward_warp(image, motion, filter=filter)
-        assert result.dtype == image.dtype
-        expected = oracles.backward_warp(image, np.float64(motion), filter)
-        step = float(jnp.finfo(image.dtype).eps)
-        # coordinates beyond 256 are not representable in bfloat16, beyond 2048 not in float16: they must not be rounded
-        np.testing.assert_allclose(np.float64(result), expected, rtol=step, atol=max(step, 3e-5))
-        same = jx.backward_warp(image, jnp.zeros_like(motion), filter=filter, outside=1)
-        np.testing.assert_array_equal(np.float64(same), np.float64(image))
+    image = jnp.asarray(random(2, 600, 1), kind)
+    motion = jnp.asarray(random_motion(2, 600, amount=3), motion_kind)
+    result = jx.backward_warp(image, motion, filter=filter)
+    assert result.dtype == image.dtype
+    expected = oracles.backward_warp(np.float64(image), np.float64(motion), filter)
+    # half-precision coordinates would be wrong by whole pixels at the right
+    step = float(jnp.finfo(image.dtype).eps)
+    np.testing.assert_allclose(np.float64(result), expected, rtol=step, atol=max(step, 1e-4))
+    same = jx.backward_warp(image, jnp.zeros_like(motion), filter=filter)
+    np.testing.assert_array_equal(np.float64(same), np.float64(image))
 
 
-def test_half_range_is_kept():
-    image = jnp.full((3, 4, 1), 65504.0, jnp.float16)
-    with jax.numpy_dtype_promotion("standard"):
-        result = jx.backward_warp(image, jnp.full((3, 4, 2), 0.3))
+def test_half_range_is_kept(x64):
+    image = jnp.full((2, 600, 1), 65504.0, jnp.float16)
+    result = jx.backward_warp(image, jnp.full((2, 600, 2), 0.3, jnp.float32))
     np.testing.assert_array_equal(np.float32(result), 65504.0)
 
 
@@ -207,8 +205,8 @@ finite = {"allow_nan": False, "allow_infinity": False, "width": 32}
 
 @property_test
 @given(
-    arrays(np.float32, (3, 5, 2), elements=st.floats(-(2.0**100), 2.0**100, **finite)),
-    arrays(np.float32, (3, 5, 2), elements=st.floats(**finite)),
+    arrays(np.float32, (5, 7, 2), elements=st.floats(-(2.0**100), 2.0**100, **finite)),
+    arrays(np.float32, (5, 7, 2), elements=st.floats(**finite)),
 )
 def test_finite_in_finite_out(image, motion):
     for filter in FILTERS:
@@ -221,115 +219,118 @@ def test_finite_in_finite_out(image, motion):
 
 @property_test
 @given(
-    arrays(np.float32, (3, 5, 2), elements=st.floats(width=32)),
-    st.integers(-7, 7),
-    st.integers(-7, 7),
+    arrays(np.float32, (5, 7, 2), elements=st.floats(width=32)),
+    st.integers(-9, 9),
+    st.integers(-9, 9),
     st.sampled_from(FILTERS),
 )
 def test_any_image_shifts_exactly(image, dx, dy, filter):
-    motion = np.full((3, 5, 2), (dx, dy), np.float32)
+    motion = np.full((5, 7, 2), (dx, dy), np.float32)
     np.testing.assert_array_equal(warp(image, motion, filter=filter), oracles.shift(image, dx, dy))
 
 
-# Gradients
+# Gradients, all in float64 and through one compiled function for each filter
 
 
-@pytest.mark.parametrize("size", SIZES, ids=str)
-@pytest.mark.parametrize("filter", FILTERS)
-def test_gradients_in_float64(x64, size, filter):
-    image = jnp.asarray(random(*size, 2, dtype=np.float64))
-    motion = jnp.asarray(random_motion(*size, dtype=np.float64))
-    check_grads(lambda i: jx.backward_warp(i, motion, filter=filter), (image,), order=1)
-    if filter != "nearest":
-        check_grads(lambda m: jx.backward_warp(image, m, filter=filter, outside=0.7), (motion,), order=1)
-    value = jnp.float64(0.3)
-    check_grads(lambda v: jx.backward_warp(image, motion, filter=filter, outside=v), (value,), order=1)
+@functools.cache
+def pullback(filter, fill):
+    @jax.jit
+    def run(image, motion, value, cotangent):
+        result, pull = jax.vjp(
+            lambda i, m, v: jx.backward_warp(i, m, filter=filter, outside=v if fill else "edge"), image, motion, value
+        )
+        return result, pull(cotangent)
+
+    return run
+
+
+def gradients(image, motion, *, filter="bilinear", value=None, cotangent=None):
+    """Of sum(result * cotangent), with respect to image, motion and the outside number."""
+    image, motion = np.float64(image), np.float64(motion)
+    cotangent = np.ones((*motion.shape[:2], image.shape[-1])) if cotangent is None else np.float64(cotangent)
+    given = np.float64(0 if value is None else value)
+    result, found = pullback(filter, value is not None)(image, motion, given, cotangent)
+    return np.asarray(result), [np.asarray(g) for g in found]
+
+
+@pytest.mark.parametrize(
+    "filter, size",
+    [("bilinear", size) for size in SIZES] + [("nearest", (5, 7)), ("bicubic", (5, 7))],
+)
+def test_gradients_against_differences_of_the_loop(x64, size, filter):
+    image, motion = random(*size, 2, dtype=np.float64), random_motion(*size, dtype=np.float64)
+    cotangent = random(*size, 2, seed=4, low=-1, dtype=np.float64)
+    result, found = gradients(image, motion, filter=filter, value=0.7, cotangent=cotangent)
+    np.testing.assert_allclose(result, oracles.backward_warp(image, motion, filter, 0.7), rtol=1e-12)
+
+    def loss(image, motion, value):
+        return np.sum(cotangent * oracles.backward_warp(image, motion, filter, float(value)))
+
+    oracles.assert_gradients(loss, (image, motion, np.float64(0.7)), found)
 
 
 @pytest.mark.parametrize("filter", ["bilinear", "bicubic"])
-def test_second_derivatives(x64, filter):
-    image = jnp.asarray(random(5, 7, 2, dtype=np.float64))
-    motion = jnp.asarray(random_motion(5, 7, dtype=np.float64))
-    check_grads(lambda i, m: jx.backward_warp(i, m, filter=filter), (image, motion), order=2, modes=["rev"])
-
-
-def motion_gradient(image, motion, **options):
-    image, motion = jnp.asarray(image), jnp.asarray(motion)
-    return np.asarray(jax.grad(lambda m: jnp.sum(jx.backward_warp(image, m, **options)))(motion))
-
-
-@pytest.mark.parametrize("size", SIZES, ids=str)
-def test_zero_motion_gradient_is_the_next_difference(size):
-    image = random(*size, 1)
-    gradient = motion_gradient(image, np.zeros((*size, 2), np.float32))
+def test_zero_motion_gradient(x64, filter):
+    """The next difference, at the last the inner one, as documented; for bicubic, which is smooth, the central one."""
+    image = random(5, 7, 2)
+    _, (_, found, _) = gradients(image, np.zeros((5, 7, 2)), filter=filter, value=0.0)
+    image = np.float64(image).sum(-1)
     for axis, along in ((1, 0), (0, 1)):
-        length = size[axis]
-        if length == 1:
-            expected = np.zeros(size)
-        else:
-            step = np.diff(image[..., 0], axis=axis)
-            expected = np.concatenate([step, np.take(step, [-1], axis)], axis)  # the inner one at the last
-        np.testing.assert_allclose(gradient[..., along], expected, atol=1e-6)
+        step = np.diff(image, axis=axis)
+        expected = np.concatenate([step, np.take(step, [-1], axis)], axis)
+        if filter == "bicubic":
+            expected = np.gradient(image, axis=axis)
+        np.testing.assert_allclose(found[..., along], expected, atol=1e-12)
 
 
-def test_zero_motion_gradient_of_bicubic_is_the_central_difference():
-    image = random(5, 7, 1)
-    gradient = motion_gradient(image, np.zeros((5, 7, 2), np.float32), filter="bicubic")
-    across, down = np.gradient(image[..., 0], axis=1), np.gradient(image[..., 0], axis=0)
-    np.testing.assert_allclose(gradient, np.stack([across, down], -1), atol=1e-6)
+@pytest.mark.parametrize("size", SIZES[1:], ids=str)
+def test_zero_motion_gradient_of_small_images(x64, size):
+    _, (image, motion, _) = gradients(random(*size, 2), np.zeros((*size, 2)), value=0.0)
+    np.testing.assert_array_equal(image, np.ones((*size, 2)))
+    for axis, along in ((1, 0), (0, 1)):
+        if size[axis] == 1:
+            np.testing.assert_array_equal(motion[..., along], 0)
 
 
 @pytest.mark.parametrize("filter", ["bilinear", "bicubic"])
-def test_gradient_beyond_the_border_is_zero(filter):
-    image = random(4, 5, 1)
-    for dx in (-0.25, -3.0, 1e6, 1e30):
-        motion = np.zeros((4, 5, 2), np.float32)
-        column = 0 if dx < 0 else 4
-        motion[:, column, 0] = dx
-        gradient = motion_gradient(image, motion, filter=filter)
-        np.testing.assert_array_equal(gradient[:, column, 0], 0)
-        assert np.abs(gradient[:, column, 1]).min() > 0, "along the border the value still changes"
+@pytest.mark.parametrize("dx", [-0.25, -0.5, 0.25, 0.5])
+def test_gradient_beyond_the_border_is_zero(x64, filter, dx):
+    motion = np.zeros((5, 7, 2))
+    column = 0 if dx < 0 else 6
+    motion[:, column, 0] = dx
+    _, (_, found, _) = gradients(random(5, 7, 2), motion, filter=filter, value=0.0)
+    np.testing.assert_array_equal(found[:, column, 0], 0)
+    assert np.abs(found[:, column, 1]).min() > 0, "along the border the value still changes"
 
 
-@pytest.mark.parametrize("filter", FILTERS)
-@pytest.mark.parametrize("outside", ["edge", 0.5])
-def test_gradients_stay_finite(filter, outside):
-    image, motion = random(4, 5, 2), random_motion(4, 5)
+@pytest.mark.parametrize("filter, value", [("nearest", 0.5), ("bilinear", None), ("bilinear", 0.5), ("bicubic", 0.5)])
+def test_gradients_stay_finite(x64, filter, value):
+    image, motion = random(5, 7, 2), random_motion(5, 7)
     motion[0, 0], motion[1, 1], motion[2, 2], motion[3, 3] = np.nan, np.inf, (0, -np.inf), 1e30
-    image_gradient, gradient = jax.grad(
-        lambda i, m: jnp.sum(jnp.square(jx.backward_warp(i, m, filter=filter, outside=outside))), argnums=(0, 1)
-    )(jnp.asarray(image), jnp.asarray(motion))
+    _, (image_gradient, found, outside) = gradients(image, motion, filter=filter, value=value)
     assert np.isfinite(image_gradient).all()
-    assert np.isfinite(gradient).all()
-    np.testing.assert_array_equal(np.asarray(gradient)[[0, 1, 2, 3], [0, 1, 2, 3]], 0)
+    assert np.isfinite(found).all()
+    for at in ((0, 0), (1, 1), (2, 2), (3, 3)):
+        np.testing.assert_array_equal(found[at], 0)
+    assert outside == (0 if value is None else 2 * (~oracles.in_frame(motion)).sum())
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("filter", ["bilinear", "bicubic"])
-def test_gradients_beside_a_bad_pixel(filter):
-    image = random(4, 5, 1)
-    image[1, 2] = np.nan
-    motion = np.zeros((4, 5, 2), np.float32)
-    image_gradient, gradient = jax.grad(
-        lambda i, m: jnp.sum(jnp.nan_to_num(jx.backward_warp(i, m, filter=filter))), argnums=(0, 1)
-    )(jnp.asarray(image), jnp.asarray(motion))
+def test_gradients_beside_a_bad_pixel(x64, filter, bad):
+    """A pixel that has no weight leaves no trace in the gradients, those of the motion included."""
+    image, cotangent = random(5, 7, 2), np.ones((5, 7, 2))
+    image[1, 2] = bad
+    cotangent[1, 2] = 0
+    _, (image_gradient, found, _) = gradients(image, np.zeros((5, 7, 2)), filter=filter, value=0.0, cotangent=cotangent)
+    others = np.ones((5, 7), bool)
+    others[1, 2] = False
     assert np.isfinite(image_gradient).all()
-    assert np.isfinite(gradient).all()
-
-
-def test_outside_gradient_counts_the_pixels_outside():
-    motion = random(4, 5, 2, low=-4, high=4)
-    motion[0, 0] = np.nan
-    image = jnp.asarray(random(4, 5, 3))
-    count = (~oracles.in_frame(motion)).sum()
-    gradient = jax.grad(lambda v: jnp.sum(jx.backward_warp(image, jnp.asarray(motion), outside=v)))(0.5)
-    assert gradient == 3 * count > 0
-    assert gradient == jax.jvp(
-        lambda v: jnp.sum(jx.backward_warp(image, jnp.asarray(motion), outside=v)), (0.5,), (1.0,)
-    )[1]
+    assert np.isfinite(found[others]).all()
 
 
 def test_no_compilation_for_another_outside_number():
-    image, motion = jnp.asarray(random(3, 4, 1)), jnp.zeros((3, 4, 2))
+    image, motion = jnp.asarray(random(5, 7, 2)), jnp.zeros((5, 7, 2))
     traces = []
 
     @jax.jit
@@ -378,5 +379,5 @@ def test_other_errors(unchecked):
 def test_numpy_arrays_are_taken(unchecked):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        image = random(3, 4, 2)
-        np.testing.assert_array_equal(jx.backward_warp(image, np.zeros((3, 4, 2), np.float32)), image)
+        image = random(5, 7, 2)
+        np.testing.assert_array_equal(jx.backward_warp(image, np.zeros((5, 7, 2), np.float32)), image)

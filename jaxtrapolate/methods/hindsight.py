@@ -55,14 +55,13 @@ def plain_share(newest: Frame, previous: Frame, motion: Float[Array, "h w 2"], *
 
 
 def hindsight_stage(by: By = "albedo+specular") -> Stage:
-    """Adds "plain_share" on the target's grid; 0 in "holes", where the plain warp shows another surface."""
+    """Adds "plain_share", carried along the motion to the target's grid."""
 
     def function(state, values: Values):
         history, motion = values["history"], values["motion"]
         newest, previous = rendered(history)[:2]
         share = plain_share(history[newest], history[previous], chain(history, newest, previous), by=by)
         x, y, _ = landing(motion)
-        carried = sample(share, (x + 0.5) / _BLOCK - 0.5, (y + 0.5) / _BLOCK - 0.5)
-        return {"plain_share": jnp.where(values["holes"], 0, carried)}
+        return {"plain_share": sample(share, (x + 0.5) / _BLOCK - 0.5, (y + 0.5) / _BLOCK - 0.5)}
 
     return Stage("hindsight", function, reads=("history.albedo", "target.albedo", "history.motion"), optional=True, past=2)

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import jax
 from jaxtyping import Array, Float
 
+from jaxtrapolate.checks import ArrayLike
 from jaxtrapolate.records import Frame, check_frame
 
 Values = Mapping[str, Any]
@@ -40,7 +41,7 @@ class Stage:
     past: int = 1
 
 
-def buffer(frame: Frame, name: str) -> Array | None:
+def buffer(frame: Frame, name: str) -> ArrayLike | None:
     """A buffer of a frame by name: "color", "motion", or one of its `GBuffer`."""
     if name in ("color", "motion", "camera", "jitter", "time"):
         return getattr(frame, name)

@@ -1,8 +1,9 @@
 """Stages that several methods share.
 
-Values they pass on: "motion", from the target to the newest rendered frame, which is "newest"; "layer", the image that
-is warped (demodulated where that can be), and "warped", the warped one; "plain_share", where the plain warp is to be
-preferred, from `jaxtrapolate.methods.hindsight`; "holes", a bool mask; "image".
+Values they pass on: "motion", from the target to the newest rendered frame, which is "newest"; "holes", a bool mask;
+"plain_share", where the colour as it is should be preferred, from `jaxtrapolate.methods.hindsight`; "layer", the image
+that is to be warped: the demodulated colour where that can be, followed by the colour as it is where "plain_share" asks
+for both; "warped", the same after warping; "image".
 """
 
 from collections.abc import Sequence
@@ -44,7 +45,9 @@ def demodulate_stage(by: By = "albedo+specular") -> Stage:
 
     def function(state, values: Values):
         newest = values["newest"]
-        return {"layer": demodulate(newest.color, newest.gbuffer, by=by)}
+        irradiance = demodulate(newest.color, newest.gbuffer, by=by)
+        both = "plain_share" in values
+        return {"layer": jnp.concatenate([irradiance, newest.color], -1) if both else irradiance}
 
     return Stage("demodulate", function, reads=("history.albedo", "target.albedo"), optional=True)
 
@@ -55,13 +58,17 @@ def layer(values: Values) -> Array:
 
 
 def modulate_stage(by: By = "albedo+specular") -> Stage:
-    """Multiplies by the target's reflectance, and takes the plain warp where hindsight prefers that."""
+    """Multiplies by the target's reflectance, and mixes in the colour that was warped as it is, by "plain_share".
+
+    That colour is the plain warp's outside holes, and in holes the method's own.
+    """
 
     def function(state, values: Values):
-        image = modulate(values["warped"], values["target"].gbuffer, by=by)
+        image = modulate(values["warped"][..., :3], values["target"].gbuffer, by=by)
         if "plain_share" in values:
             plain = backward_warp(values["newest"].color, values["motion"])
-            image = jnp.where(values["plain_share"] > 0, image + values["plain_share"] * (plain - image), image)
+            plain = jnp.where(values["holes"], values["warped"][..., 3:], plain)
+            image = image * (1 - values["plain_share"]) + plain * values["plain_share"]
         return {"image": image}
 
     return Stage("modulate", function, reads=("history.albedo", "target.albedo"), optional=True)

@@ -39,7 +39,7 @@ def occlusion_warp() -> Method:
         image = layer(values)
         along = jnp.where(values["holes"], values["occlusion_motion"], values["motion"])
         warped = backward_warp(image, along)
-        return {"warped": warped, "image": warped}
+        return {"warped": warped, "image": warped[..., :3]}
 
     stages = (
         REPROJECT,
@@ -69,7 +69,7 @@ def guided() -> Method:
     def function(state, values: Values):
         target_guide, source_guide = guides(values["target"].gbuffer, values["newest"].gbuffer)
         warped = guided_warp(layer(values), values["motion"], target_guide, source_guide)
-        return {"warped": warped, "image": warped}
+        return {"warped": warped, "image": warped[..., :3]}
 
     reads = tuple("|".join(f"{role}.{n}" for n in (*_GUIDES, "stencil")) for role in ("target", "history"))
     stages = (

@@ -118,14 +118,14 @@ def _facts(results: Mapping[str, Any], methods: Sequence[MethodResult]) -> list[
 
 
 def _tops(columns: Sequence[Sequence[float | None]], *, least: Sequence[int] = ()) -> list[float | None]:
-    """The best value of each column, the largest or, for those in `least`, the smallest."""
-    found = [[v for v in column if v is not None] for column in columns]
-    return [((min if i in least else max)(c) if c else None) for i, c in enumerate(found)]
+    """The best value of each column, the largest or, for those in `least`, the smallest; None where all are alike."""
+    found = [{v for v in column if v is not None} for column in columns]
+    return [((min if i in least else max)(c) if len(c) > 1 else None) for i, c in enumerate(found)]
 
 
 def _method_rows(methods, best, reference) -> list[dict[str, Any]]:
     columns = [[m.psnr for m in methods], [m.ssim for m in methods], [m.ms.median for m in methods]]
-    tops = _tops(columns, least=(2,)) if len(methods) > 1 else [None] * 3
+    tops = _tops(columns, least=(2,))
     rows = []
     for m in methods:
         marks = [
@@ -170,7 +170,7 @@ def _cause_rows(methods: Sequence[MethodResult]) -> list[dict[str, Any]]:
     for m in methods:
         if m.by_cause:
             found = [m.by_cause.get(c, (None,))[0] for c in causes]
-            marks = [len(methods) > 1 and v is not None and v == top for v, top in zip(found, tops, strict=True)]
+            marks = [v is not None and v == top for v, top in zip(found, tops, strict=True)]
             cells = list(zip([values.fixed(v) for v in found], marks, strict=True))
             rows.append({"name": m.name, "color": m.color, "cells": cells})
     return rows
@@ -225,7 +225,7 @@ def _frame(entry, methods, best, reference, pictures: "_Pictures") -> dict[str, 
 
     def picture(key: str, path: Any, name: str, text: str) -> dict[str, str] | None:
         uri = pictures.uri(path)
-        return uri and {"key": key, "uri": uri, "name": name, "alt": f"Frame {label}: {text}"}
+        return {"key": key, "uri": uri, "name": name, "alt": f"Frame {label}: {text}"} if uri else None
 
     def pair(name: str, detail: str, color: str | None, *found: dict[str, str] | None) -> dict[str, Any] | None:
         there = [p for p in found if p]
@@ -252,12 +252,8 @@ def _frame(entry, methods, best, reference, pictures: "_Pictures") -> dict[str, 
     ]
     sheet, buffers = [p for p in sheet if p], [b for b in buffers if b]
     keys = [p["key"] for card in sheet for p in card["pictures"]]
-    makers = [f"image:{m.name}" for m in (reference, best) if m is not None]
-    wishes = [k for k in (*makers, "truth", "previous", *keys) if k in keys]
-    wishes = list(dict.fromkeys(wishes))
-    left, right = (wishes * 2)[:2] if wishes else (None, None)
-    if len(makers) < 2 and len(wishes) > 1:
-        left, right = wishes[1], wishes[0]
+    wishes = [f"image:{m.name}" for m in (best, reference) if m is not None] + ["truth", "previous", *keys]
+    right, left = ([key for key in dict.fromkeys(wishes) if key in keys] * 2)[:2] if keys else (None, None)
     winner = max((s for s in scores.items() if s[1].psnr is not None), key=lambda s: s[1].psnr, default=None)
     summary = f"best: {winner[0]}, {values.fixed(winner[1].psnr)} dB" if winner else ""
     return {"label": label, "sheet": sheet, "buffers": buffers, "left": left, "right": right, "summary": summary}

@@ -9,15 +9,17 @@ import itertools
 import math
 import threading
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.lines import Line2D
+from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
-from matplotlib.transforms import Bbox
+from matplotlib.transforms import Bbox, BboxBase
 
 from jaxtrapolate.causes import CAUSES
 from jaxtrapolate.report.values import MethodResult, fixed, percent, read_methods
@@ -27,6 +29,10 @@ _DARK = {_INK: "#e8ebee", _SOFT: "#a5adb6", _GRID: "#3a4149"}
 _FONT = "DejaVu Sans"
 _WIDTH = 5.4
 _LOCK = threading.Lock()
+
+_OFFSETS = ((9, 0), (-9, 0), (0, 9), (0, -9), (7, 7), (7, -7), (-7, 7), (-7, -7))
+_NEAR = len(_OFFSETS)
+_OFFSETS += ((24, 20), (24, -20), (-24, 20), (-24, -20), (0, 28), (0, -28), (34, -36), (-34, 36))
 
 
 def _style_sheet() -> str:
@@ -76,7 +82,7 @@ def _nothing(figure: Figure, axes: Any, text: str) -> bytes:
     return _svg(figure)
 
 
-def _legend(figure: Figure, methods: Sequence[MethodResult], *, line: str) -> None:
+def _legend(figure: Figure, methods: Sequence[MethodResult], *, line: Literal["-", "none"]) -> None:
     """One entry a method above the axes. Names may hold any sign, so the labels are set afterwards, as plain text."""
     handles = [Line2D([], [], color=m.color, marker=m.marker, markersize=6, linestyle=line) for m in methods]
     fitting = max(1, int(66 / (max(len(_drawable(m.name)) for m in methods) + 5)))
@@ -115,30 +121,37 @@ def _place_labels(
     stairs: Sequence[tuple[float, float]],
 ) -> None:
     """A label beside each point, on the side where it covers least of other points and labels and of the stairs."""
-    renderer = figure.canvas.get_renderer()
+    renderer = FigureCanvasAgg(figure).get_renderer()
     figure.draw_without_rendering()
     inner = axes.get_window_extent(renderer)
     centers = [axes.transData.transform(point) for point in points]
-    taken = [Bbox.from_bounds(x - 7, y - 7, 14, 14) for x, y in centers]
+    taken = [Bbox.from_bounds(x - 10, y - 8, 20, 16) for x, y in centers]
     corners_of_stairs = axes.transData.transform(stairs)
     lines = []
     for (left, low), (right, high) in itertools.pairwise(corners_of_stairs):
         lines += [Bbox([[left, low - 2], [right, low + 2]]), Bbox([[right - 2, low], [right + 2, high]])]
-    sides = ((9, 0, "left", "center"), (-9, 0, "right", "center"), (0, 9, "center", "bottom"), (0, -9, "center", "top"))
-    corners = ((7, 7, "left", "bottom"), (7, -7, "left", "top"), (-7, 7, "right", "bottom"), (-7, -7, "right", "top"))
     for index, (point, text) in enumerate(zip(points, texts, strict=True)):
-        best = None
-        for order, (dx, dy, horizontal, vertical) in enumerate(sides + corners):
+        best: tuple[float, Any, Any] = (math.inf, None, None)
+        for order, (dx, dy) in enumerate(_OFFSETS):
+            align = {"ha": ("center", "left", "right")[np.sign(dx)], "va": ("center", "bottom", "top")[np.sign(dy)]}
+            leader = {"arrowstyle": "-", "color": _SOFT, "linewidth": 0.7} if order >= _NEAR else None
             label = axes.annotate(
-                text, point, (dx, dy), textcoords="offset points", color=_INK, fontsize=10, ha=horizontal, va=vertical
+                text, point, (dx, dy), textcoords="offset points", color=_INK, fontsize=10, arrowprops=leader, **align
             )
             label.set(parse_math=False, in_layout=False)
-            box = label.get_window_extent(renderer)
+            label.update_positions(renderer)
+            box = Text.get_window_extent(label, renderer)  # without the leader
             outside = box.width * box.height - _overlap(box, inner)
             covered = sum(_overlap(box, other) for i, other in enumerate(taken) if i != index)
-            cost = covered + 2 * outside + sum(_overlap(box, line) for line in lines) + 1e-3 * order
-            if best is None or cost < best[0]:
-                if best is not None:
+            cost = (
+                covered
+                + 2 * outside
+                + sum(_overlap(box, line) for line in lines)
+                + (20 if leader else 0)
+                + 1e-3 * order
+            )
+            if cost < best[0]:
+                if best[1] is not None:
                     best[1].remove()
                 best = (cost, label, box)
             else:
@@ -146,7 +159,7 @@ def _place_labels(
         taken.append(best[2])
 
 
-def _overlap(first: Bbox, second: Bbox) -> float:
+def _overlap(first: BboxBase, second: BboxBase) -> float:
     common = Bbox.intersection(first, second)
     return 0.0 if common is None else common.width * common.height
 
@@ -171,12 +184,13 @@ def plot_error_time(results: Mapping[str, Any]) -> bytes:
 
 
 def _error_time(methods: Sequence[MethodResult]) -> bytes:
-    figure, axes = _axes(3.6)
-    drawn = [m for m in methods if m.psnr is not None and m.ms.median]
-    if not drawn:
+    figure, axes = _axes(3.8)
+    known = [(m, m.psnr, m.ms.median) for m in methods if m.psnr is not None and m.ms.median]
+    if not known:
         return _nothing(figure, axes, "no method with both dB and run time")
-    heights, _ = _ceiling([m.psnr for m in drawn])
-    times = [m.ms.median for m in drawn]
+    drawn = [method for method, _, _ in known]
+    heights, _ = _ceiling([psnr for _, psnr, _ in known])
+    times = [time for _, _, time in known]
     points = list(zip(times, heights, strict=True))
     span = max(max(heights) - min(heights), 1.0)
     low, high = min(times), max(times)
@@ -192,10 +206,10 @@ def _error_time(methods: Sequence[MethodResult]) -> bytes:
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / low < 300 else (1,)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+    axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10], min_n_ticks=4))
     _labels(axes, "milliseconds a frame (median, log)", "PSNR, dB")
-    texts = [_drawable(m.name) + (f" ({fixed(m.psnr)} dB)" if math.isinf(m.psnr) else "") for m in drawn]
-    axes.text(0.995, 0.015, "dashed: Pareto front", color=_SOFT, fontsize=8.5, ha="right", transform=axes.transAxes)
+    texts = [_drawable(m.name) + (f" ({fixed(psnr)} dB)" if math.isinf(psnr) else "") for m, psnr, _ in known]
+    axes.set_title("dashed: Pareto front", loc="right", color=_SOFT, fontsize=8.5, pad=4)
     _place_labels(figure, axes, points, texts, stairs)
     return _svg(figure)
 
@@ -234,7 +248,7 @@ def _causes(methods: Sequence[MethodResult]) -> bytes:
     axes.set_yticks(range(len(causes)), names)
     axes.set_ylim(len(causes) - 0.5, -0.5)
     axes.grid(False, axis="y")
-    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10], min_n_ticks=4))
     _labels(axes, "PSNR, dB" + ("" if top is None else " (rightmost: infinite)"), "")
     _legend(figure, drawn, line="none")
     return _svg(figure)
@@ -262,7 +276,7 @@ def _frames(methods: Sequence[MethodResult]) -> bytes:
         numbers = [f.number for f in method.frames]
         axes.plot(numbers, values, color=method.color, marker=method.marker, markersize=size, linewidth=1.8)
     axes.xaxis.set_major_locator(MaxNLocator(8, integer=True, min_n_ticks=1))
-    axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+    axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10], min_n_ticks=4))
     _labels(axes, "frame", "PSNR, dB" + ("" if top is None else " (top: infinite)"))
     _legend(figure, drawn, line="-")
     return _svg(figure)

@@ -83,7 +83,10 @@
     stage.addEventListener("dblclick", (event) => {
       const at = place(event);
       if (view.scale > 1) look(1, 0.5, 0.5);
-      else look(4, at.x, at.y);
+      else {
+        look(4, at.x, at.y);
+        split(clamp((0.5 + (at.x - view.x) * view.scale) * 100, 0, 100)); // the divider stays on the point
+      }
     });
     stage.addEventListener("keydown", (event) => {
       const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
@@ -145,6 +148,7 @@
     state();
     view.stage.dispatchEvent(new MouseEvent("dblclick", { clientX: box.left + box.width / 2, clientY: box.top + box.height / 2 }));
     root.dataset.selftestZoom = String(view.view.scale);
+    root.dataset.selftestOverflow = String(root.scrollWidth - root.clientWidth);
     root.dataset.selftest = seen.join(";");
   }
 

@@ -6,6 +6,7 @@ none passes through a crest, and end with Newton's iteration.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +42,7 @@ class HeightField:
         """The slope that steps are cut by."""
         return _BRAKE * 8 * jnp.sum(jnp.abs(self.amplitude) * jnp.linalg.norm(self.direction, axis=-1))
 
-    def height(self, x: Array, y: Array) -> Array:
+    def height(self, x: Any, y: Any) -> Any:
         """h, by point."""
         total = self.base + jnp.zeros_like(x)
         for k in range(self.amplitude.shape[-1]):

@@ -1,7 +1,5 @@
 """What several scenes share: skies, surfaces, camera paths, figures and trees."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from jaxtrapolate.scenes.kinematics import Path
@@ -40,7 +38,7 @@ def daylight(rng: Generator, *, cover: float | None = None, haze: float = 0.0) -
     )
 
 
-def sun_from(azimuth: float, elevation: float | int) -> np.ndarray:
+def sun_from(azimuth: float | int, elevation: float | int) -> np.ndarray:
     """The unit vector towards a sun, by angles in degrees."""
     a, e = np.radians(azimuth), np.radians(elevation)
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
@@ -81,7 +79,7 @@ def camera(eye: Path, target: Path, *, degrees: float = 50.0, roll: float = 0.0)
     return CameraPath(eye, target, np.float32(roll), np.float32(np.tan(np.radians(degrees) / 2)))  # type: ignore[arg-type]
 
 
-def spots(rng: Generator, count: int, low: Sequence[float], high: Sequence[float], apart: float) -> np.ndarray:
+def spots(rng: Generator, count: int, low: object, high: object, apart: float | int) -> np.ndarray:
     """Points `[count, 2]` in a rectangle, no two nearer than `apart` if that can be had, by best candidate."""
     points = [rng.uniform(low, high)]
     while len(points) < count:

@@ -9,7 +9,7 @@ from jaxtrapolate.scenes.scene import Builder, Scene, material, path, turn, yaw
 def demo(rng: np.random.Generator) -> Scene:
     """The scene that the command `demo` runs on."""
     b = Builder()
-    stone = common.shifted(rng, (0.46, 0.42, 0.37))
+    stone = common.shifted(rng, (0.36, 0.32, 0.27))
     ground = material(
         stone,
         color_b=0.45 * stone,
@@ -95,6 +95,6 @@ def demo(rng: np.random.Generator) -> Scene:
         camera=common.camera(eye, target, degrees=rng.uniform(42, 50)),
         sky=common.daylight(rng),
         sun_direction=common.sun_from(rng.uniform(0, 360), rng.uniform(32, 50)),
-        sun_color=np.array([1.0, 0.9, 0.74]) * rng.uniform(1.7, 2.2),
+        sun_color=np.array([1.0, 0.9, 0.74]) * rng.uniform(1.3, 1.7),
         sun_radius=0.02,
     )

@@ -9,7 +9,7 @@ from jaxtrapolate.scenes.scene import Builder, Scene, material, path, turn, yaw
 def walkers(rng: np.random.Generator) -> Scene:
     """Three figures walk with non-linear motion on a plaza of columns under a turning camera."""
     b = Builder()
-    stone = common.shifted(rng, (0.4, 0.36, 0.31))
+    stone = common.shifted(rng, (0.34, 0.29, 0.23))
     paving = material(
         stone,
         color_b=0.55 * stone,
@@ -49,7 +49,7 @@ def walkers(rng: np.random.Generator) -> Scene:
         ),
         sky=common.daylight(rng),
         sun_direction=common.sun_from(rng.uniform(0, 360), rng.uniform(30, 45)),
-        sun_color=np.array([1.0, 0.88, 0.7]) * rng.uniform(1.8, 2.3),
+        sun_color=np.array([1.0, 0.88, 0.7]) * rng.uniform(1.3, 1.7),
         sun_radius=0.015,
         bounce=False,
     )

@@ -8,6 +8,9 @@ from jaxtrapolate.scenes.scene import Builder, Scene, material, path, turn, yaw
 
 WAVES = 7
 
+GABLE = np.array([[1.0, 0, 1], [0, np.sqrt(2), 0], [-1, 0, 1]]) / np.sqrt(2)
+"""An eighth of a turn about y: a box that stands on its edge is a roof."""
+
 UPRIGHT = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 """A blade's pose that stands on its edge: its x up, its y ahead."""
 
@@ -65,7 +68,7 @@ def terrain(rng: np.random.Generator) -> Scene:
         ),
         sky=common.daylight(rng, haze=0.0015),
         sun_direction=common.sun_from(rng.uniform(0, 360), rng.uniform(32, 45)),
-        sun_color=np.array([1.0, 0.87, 0.68]) * rng.uniform(2.0, 2.5),
+        sun_color=np.array([1.0, 0.87, 0.68]) * rng.uniform(1.6, 2.0),
         sun_radius=0.01,
         bounce=False,
     )
@@ -86,7 +89,10 @@ def windmill(rng: np.random.Generator) -> Scene:
         roughness=0.9,
     )
     b.add("plane", (0, 0, 0), (1, 1, 1), field)
-    wall = material(common.shifted(rng, (0.7, 0.66, 0.58)), noise=0.2, noise_frequency=2, roughness=0.8)
+    plaster = common.shifted(rng, (0.5, 0.44, 0.36))
+    wall = material(
+        plaster, color_b=0.5 * plaster, frequency=(0, 0, 1.3), duty=0.2, noise=0.3, noise_frequency=2, roughness=0.8
+    )
     roof = material(common.shifted(rng, (0.42, 0.13, 0.08)), noise=0.3, noise_frequency=4, roughness=0.7)
     sail = material(
         (0.75, 0.72, 0.64), color_b=(0.3, 0.2, 0.12), frequency=(2.2, 2.2, 0), duty=0.2, tiled=1, roughness=0.7
@@ -97,8 +103,10 @@ def windmill(rng: np.random.Generator) -> Scene:
         a = start + 2 * np.pi * k / 3 + rng.uniform(-0.3, 0.3)
         x, y = np.array([np.cos(a), np.sin(a)]) * rng.uniform(2.6, 3.4)
         height = rng.uniform(4.0, 5.0)
-        b.add("sphere", (x, y, 0.45 * height), (0.95, 0.95, 0.75 * height), wall)
-        b.add("sphere", (x, y, height), (0.75, 0.75, 0.7), roof)
+        for part, half in enumerate((0.85, 0.72, 0.6)):
+            z = height * (0.15 + 0.3 * part)
+            b.add("box", (x, y, z), (half, half, 0.15 * height), wall, rotation=yaw(0.3 + k))
+        b.add("box", (x, y, 0.92 * height), (0.5, 0.62, 0.5), roof, rotation=yaw(0.3 + k) @ GABLE)
         facing = rng.uniform(0, 2 * np.pi)
         hub = b.body(path((x, y, height)), turn(angle=facing))
         speed = rng.choice([-1, 1]) * rng.uniform(0.1, 0.16)
@@ -133,7 +141,7 @@ def windmill(rng: np.random.Generator) -> Scene:
         ),
         sky=common.daylight(rng),
         sun_direction=common.sun_from(rng.uniform(0, 360), rng.uniform(30, 42)),
-        sun_color=np.array([1.0, 0.88, 0.7]) * rng.uniform(2.0, 2.4),
+        sun_color=np.array([1.0, 0.88, 0.7]) * rng.uniform(1.4, 1.8),
         sun_radius=0.0,
         bounce=False,
     )
@@ -145,9 +153,7 @@ def forest(rng: np.random.Generator) -> Scene:
     moss = common.shifted(rng, (0.2, 0.19, 0.08), 0.15)
     floor = material(
         moss,
-        color_b=(0.13, 0.08, 0.04),
-        frequency=(0.3, 0.24, 0),
-        noise=0.8,
+        noise=0.7,
         noise_frequency=1.1,
         offset=common.offset(rng) * (1, 1, 0),
         roughness=0.95,
@@ -186,7 +192,7 @@ def forest(rng: np.random.Generator) -> Scene:
         ),
         sky=common.sky((0.3, 0.42, 0.5), (0.62, 0.68, 0.6), (0.12, 0.12, 0.06), cover=0.2, ambient=0.5, haze=0.012),
         sun_direction=common.sun_from(rng.uniform(0, 360), rng.uniform(38, 50)),
-        sun_color=np.array([1.0, 0.85, 0.6]) * rng.uniform(2.2, 2.8),
+        sun_color=np.array([1.0, 0.85, 0.6]) * rng.uniform(1.6, 2.1),
         sun_radius=0.012,
         bounce=False,
     )

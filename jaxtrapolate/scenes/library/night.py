@@ -101,16 +101,17 @@ def street(rng: np.random.Generator) -> Scene:
         wall = common.shifted(rng, (0.3, 0.22, 0.18), 0.3)
         lit = np.array([1.0, 0.72, 0.4]) * rng.uniform(0.5, 1.6) if k % 2 else np.array([0.5, 0.7, 1.0]) * 0.6
         house = material(
-            wall,
-            color_b=(0.05, 0.05, 0.06),
+            (0.05, 0.05, 0.06),
+            color_b=wall,
             frequency=(0.0, 0.55, 0.5),
             duty=0.5,
+            tiled=1,
             offset=common.offset(rng),
             noise=0.3,
             noise_frequency=2,
-            roughness=0.7,
-            roughness_b=0.15,
-            emission_b=lit * 0.35,
+            roughness=0.15,
+            roughness_b=0.7,
+            emission=lit * 0.5,
         )
         b.add("box", (r * np.cos(a), r * np.sin(a), size[2]), size, house, rotation=yaw(a))
     iron = material((0.05, 0.05, 0.05), roughness=0.35)
