@@ -28,6 +28,12 @@ def disoccluded(target: Keyframe, source: Keyframe) -> Bool[Array, "h w"]:
 
     Args:
         target: with depth and backward_flow. source: the I-frame before it, with depth; both in one metric unit.
+
+    Returns:
+        Bool `[H, W]`.
+
+    Raises:
+        TypeError, ValueError: a field is absent, no floating-point array, or of another size.
     """
     check_present("target.backward_flow", target.backward_flow, needed_by="disoccluded")
     size = check_image("target.backward_flow", target.backward_flow, channels=3)
@@ -64,7 +70,8 @@ def edges(gbuffer: GBuffer, *, metric_depth: bool) -> Bool[Array, "h w 1"] | Non
     """Pixels within 2 of a jump of depth or normal; `None` without both buffers.
 
     Metric depth jumps where its inverse, which is linear on any plane, bends by more than 5 % of itself between three
-    neighbours; ordinal depth, where it bends by more than 0.05; the normal, where its cosine to a neighbour is below 0.8.
+    neighbours; ordinal depth, where it bends by more than 0.05; the normal, where its cosine to a neighbour is below
+    0.8.
     """
     jumps = []
     if gbuffer.depth is not None:
@@ -94,7 +101,9 @@ def _cause_map(target, source, motion, hidden, metric) -> Int[Array, "h w"]:
     border = ~in_frame(motion)[..., None]
     if hidden is None:
         masks = hole_masks(here, there, motion)
-        hidden = jnp.any(jnp.stack([m for m in (masks.stencil, masks.normal, masks.position) if m is not None] + [no]), 0)
+        hidden = jnp.any(
+            jnp.stack([m for m in (masks.stencil, masks.normal, masks.position) if m is not None] + [no]), 0
+        )
     else:
         hidden = hidden[..., None]
     shadow = glossy = no
@@ -131,7 +140,11 @@ def cause_map(
         hidden: the exact holes (`disoccluded`); without it the union of the `hole_masks` that the buffers allow.
         metric_depth: whether depth is a distance, or only ordered.
 
-    Causes whose buffers are absent do not occur.
+    Returns:
+        int32 `[H, W]`. Causes whose buffers are absent do not occur.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, or a size that differs.
     """
     size = check_image("motion", motion, channels=2)
     check_frame("target", target, size=size)

@@ -26,7 +26,8 @@ def check_array(name: str, value: Any, *, shape: Sequence[int | str]) -> tuple[i
     if not jnp.issubdtype(value.dtype, jnp.floating):
         raise TypeError(f"{name}: expected a floating-point array {expected}, got dtype {value.dtype}")
     got = tuple(value.shape)
-    fits = len(got) == len(shape) and all(g >= 1 and (isinstance(s, str) or g == s) for g, s in zip(got, shape))
+    sizes = zip(got, shape, strict=False)
+    fits = len(got) == len(shape) and all(g >= 1 and (isinstance(s, str) or g == s) for g, s in sizes)
     if not fits:
         raise ValueError(f"{name}: expected shape {expected}, got {list(got)}")
     return got

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrapolate.causes import CAUSES, cause_map, disoccluded
+from jaxtrapolate.checks import ArrayLike
 from jaxtrapolate.files import Sequence, prefetch, runs
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.metrics import psnr, ssim
@@ -78,7 +79,7 @@ def arguments(method: Method, window: Window) -> tuple[tuple[Frame, ...], Frame,
     return history, window.target, window.future[: max(0, 2 * method.future - 1)]
 
 
-def display(color: Float[Array, "h w 3"], *, hdr: bool) -> Float[Array, "h w 3"]:
+def display(color: Float[ArrayLike, "h w 3"], *, hdr: bool) -> Float[Array, "h w 3"]:
     """The image in which scores are taken: HDR after x / (1 + x) and gamma 1 / 2.2, 8-bit input in sRGB."""
     return tonemap(color) if hdr else srgb_encode(jnp.clip(color, 0, 1))
 

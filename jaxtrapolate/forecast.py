@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.gather import backward_warp
-from jaxtrapolate.records import Frame, GBuffer, replace
+from jaxtrapolate.records import Frame, GBuffer, check_frame, replace
 from jaxtrapolate.scatter import splat_nearest
 
 
@@ -29,7 +29,11 @@ def forecast(frame: Frame, fraction: float | Float[Array, ""]) -> Frame:
 
     Returns:
         A `Frame` without colour, shadow and sky colour; its motion leads to `frame`.
+
+    Raises:
+        TypeError, ValueError: no motion, or buffers whose sizes differ.
     """
+    check_frame("frame", frame)
     check_present("frame.motion", frame.motion, needed_by="forecast")
     onward = -fraction * frame.motion
     depth = None if frame.gbuffer is None else frame.gbuffer.depth

@@ -63,7 +63,9 @@ def take_rows(rows: Shaped[Array, "n c"], index: Array) -> Array:
     return jax.lax.gather(rows, index[..., None], dimensions, (1, rows.shape[1]), mode="promise_in_bounds")
 
 
-def take_offsets(image: Float[Array, "h w c"], row: Array, column: Array, offsets: list[tuple[int, int]]) -> list[Array]:
+def take_offsets(
+    image: Float[Array, "h w c"], row: Array, column: Array, offsets: list[tuple[int, int]]
+) -> list[Array]:
     """image[row + j, column + i] for each offset (j, i) >= 0, where all of those are in bounds.
 
     One index serves all taps, each looking at its own slice of the image: XLA holds an index within the bounds of what
@@ -128,12 +130,12 @@ def _bilinear(product, image, x, y):
     taps = take_offsets(image, row, column, [(0, 0), (0, right), (down, 0), (down, right)])
     # a (1 - t) + b t returns a tap bit for bit at t = 0 and t = 1; a + t (b - a) does not
     weights = [(1 - t) * (1 - u), t * (1 - u), (1 - t) * u, t * u]
-    a, b, c, d = (product(tap.astype(wide), weight.astype(wide)) for tap, weight in zip(taps, weights))
+    a, b, c, d = (product(tap.astype(wide), weight.astype(wide)) for tap, weight in zip(taps, weights, strict=False))
     return (a + b) + (c + d)
 
 
 def _catmull_rom(t, lower, size):
-    """Weights of the taps lower - 1 .. lower + 2; a tap beyond the frame is extrapolated linearly from the two inside."""
+    """Weights of the taps lower - 1 .. lower + 2; one beyond the frame is extrapolated linearly from the two inside."""
     before = t * (-0.5 + t * (1 - 0.5 * t))
     at = 1 + t * t * (1.5 * t - 2.5)
     after = t * (0.5 + t * (2 - 1.5 * t))
@@ -191,7 +193,7 @@ def backward_warp(
     motion: Float[ArrayLike, "i j 2"],
     *,
     filter: Filter = "bilinear",
-    outside: Literal["edge", "zero"] | float | Float[ArrayLike, ""] = "edge",
+    outside: Literal["edge", "zero"] | int | float | Float[ArrayLike, ""] = "edge",
 ) -> Float[Array, "i j c"]:
     """The image fetched along the motion: result[p] = image(p + motion[p]).
 
@@ -210,7 +212,7 @@ def backward_warp(
         The frame ends half a pixel beyond the outermost centres.
 
     Exactness:
-        Zero motion returns the image bit for bit; an integer shift returns the shifted image bit for bit (but a negative
+        Zero motion returns the image bit for bit; an integer shift returns the shifted image bit for bit (a negative
         zero may lose its sign). A pixel contributes only where its weight is not 0: a NaN or infinity beside a landing
         place on a pixel does not spread.
 

@@ -22,6 +22,7 @@ Guides = Literal["float32", "packed"]
 _NO_TAP = 63
 _NONE = np.uint32(0xFFFFFFFF)
 _STRIP = 16  # rows
+_LEAST = 1e-12  # sigma
 
 
 def guided_taps(strides: Sequence[int]) -> list[tuple[int, int]]:
@@ -46,6 +47,8 @@ def _factors(sigma_guide, sigma_space):
     cost = guide * |guide difference|^2 + space * |distance|^2 is then 2 m^2 times the negative logarithm of the weight:
     the order is kept, and no sigma makes it over- or underflow.
     """
+    # below this a cube underflows float32, and XLA makes one division of several: 0 / 0
+    sigma_guide, sigma_space = (jnp.where(sigma > _LEAST, sigma, _LEAST) for sigma in (sigma_guide, sigma_space))
     m = jnp.minimum(sigma_guide, sigma_space)
     return m, (m / sigma_guide) ** 2, (m / sigma_space) ** 2
 
@@ -179,22 +182,23 @@ def guided_warp(
     source_guide: Float[ArrayLike, "h w g"],
     *,
     strides: Sequence[int] = (1, 3, 5, 9),
-    sigma_guide: float | Float[ArrayLike, ""] = 0.05,
+    sigma_guide: float | Float[ArrayLike, ""] = 0.03,
     sigma_space: float | Float[ArrayLike, ""] = 0.5,
     keep: int = 4,
     guides: Guides = "float32",
 ) -> Float[Array, "h w c"]:
     """The image fetched along the motion, from the most similar of the pixels around the landing place.
 
-    w(y) = exp(-|target_guide(p) - source_guide(y)|^2 / (2 sigma_guide^2)) exp(-|p + motion[p] - y|^2 / (2 sigma_space^2))
-    for the taps y; the `keep` largest are normalised and blended.
+    w(y) = exp(-|target_guide(p) - source_guide(y)|^2 / (2 sigma_guide^2))
+         * exp(-|p + motion[p] - y|^2 / (2 sigma_space^2)) for the taps y; the `keep` largest are normalised, blended.
 
     Args:
         image: `[H, W, C]` of the source frame, demodulated as a rule. motion: `[H, W, 2]` from target to source.
         target_guide, source_guide: `[H, W, G]`, albedo and normal in the paper.
         strides: of the 3 x 3 kernels, all distinct, 1 to 7 of them. The taps are the distinct pixels
             round(p + motion[p]) + stride * (k, l); distances are measured from the unrounded place.
-        sigma_guide: in units of the guides. sigma_space: in pixels. Both > 0; traced, so that they can be fitted.
+        sigma_guide: in units of the guides. sigma_space: in pixels. Both > 0 (below 1e-12 they count as that); traced,
+            so that they can be fitted.
         keep: how many taps are blended, 1 to 5.
         guides: "float32", or "packed": the ranking of the taps compares guides rounded to float16 (of up to 65504) and
             reads half the memory; whether that is faster depends on the machine. The weights of the taps that were

@@ -12,7 +12,6 @@ from jaxtrapolate.checks import ArrayLike, check_choice, check_image
 from jaxtrapolate.gather import backward_warp, cell, inside, landing, sample, take_offsets
 from jaxtrapolate.records import GBuffer, check_gbuffer, record
 
-
 Taps = Literal["weighted", "release"]
 
 
@@ -74,7 +73,7 @@ def _taps(image, x, y):
     t, u = t[..., None], u[..., None]
     right, down = int(width > 1), int(height > 1)
     values = take_offsets(image, row, column, [(0, 0), (0, right), (down, 0), (down, right)])
-    return list(zip(values, [(1 - t) * (1 - u), t * (1 - u), (1 - t) * u, t * u]))
+    return list(zip(values, [(1 - t) * (1 - u), t * (1 - u), (1 - t) * u, t * u], strict=False))
 
 
 def _soft(excess, softness):
@@ -138,11 +137,12 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
             limit = limit + jnp.where(jnp.isfinite(target.depth), per_depth * jnp.abs(target.depth), 0)
         farthest = jnp.zeros(outside.shape, target.position.dtype)
         for place, weight in _taps(source.position, x, y):
-            apart = place - target.position
-            squared = _dot(apart, apart)
+            known = _dot(place, place) + _dot(target.position, target.position) < jnp.inf
+            apart = jnp.where(known, place - target.position, 0)
+            squared = jnp.where(known, _dot(apart, apart), jnp.inf)
             if taps == "weighted":
                 squared = jnp.where(weight > 0, squared, 0)
-            farthest = jnp.maximum(farthest, squared)  # a NaN stays
+            farthest = jnp.maximum(farthest, squared)
         if taps == "release":
             farthest = jnp.where(outside, jnp.inf, farthest)
         concerned = still if taps == "release" else still & seen
@@ -221,6 +221,6 @@ def hole_masks(
     if position_threshold is None:
         position_threshold = _RELEASE if taps == "release" else 2.0
     soft = not (isinstance(softness, (int, float)) and softness == 0)
-    absolute = isinstance(position_threshold, tuple)
+    absolute = isinstance(position_threshold, tuple | list)
     thresholds = softness, normal_threshold, position_threshold
     return _hole_masks(target, source, motion, thresholds, taps=taps, soft=soft, absolute=absolute)

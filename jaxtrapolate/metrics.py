@@ -17,10 +17,18 @@ _RADIUS = 5  # an 11 x 11 window
 def _mean(values, mask):
     if mask is None:
         return jnp.mean(values)
-    mask = jnp.broadcast_to(mask, values.shape)
+    mask = jnp.broadcast_to(mask, values.shape).astype(values.dtype)
     count = jnp.sum(mask)
-    total = jnp.sum(jnp.where(mask > 0, values * mask, 0))
+    total = jnp.sum(mask * jnp.where(mask > 0, values, 0))
     return jnp.where(count > 0, total / jnp.where(count > 0, count, 1), jnp.nan)
+
+
+def _squared_error(first, second, mask):
+    wide = jnp.promote_types(jnp.promote_types(first.dtype, second.dtype), jnp.float32)
+    first, second = first.astype(wide), second.astype(wide)
+    if mask is not None:  # before the square, so that what is left out has no part in the gradient either
+        first, second = jnp.where(mask > 0, first, 0), jnp.where(mask > 0, second, 0)
+    return _mean(jnp.square(first - second), mask)
 
 
 def _check(first, second, mask):
@@ -31,15 +39,21 @@ def _check(first, second, mask):
 
 
 @jax.jit
-def mse(
-    first: Float[Array, "h w c"], second: Float[Array, "h w c"], *, mask: Array | None = None
-) -> Float[Array, ""]:
-    """The mean squared difference over all channels, over the pixels where `mask` `[H, W, 1]` is set.
+def mse(first: Float[Array, "h w c"], second: Float[Array, "h w c"], *, mask: Array | None = None) -> Float[Array, ""]:
+    """The mean squared difference over all channels.
 
-    A mask may be bool or weights; an empty one gives NaN.
+    Args:
+        first, second: `[H, W, C]`; the sum is taken in at least float32.
+        mask: `[H, W, 1]`, bool or weights: the pixels that count.
+
+    Returns:
+        A scalar; NaN for an empty mask.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, or shapes that differ.
     """
     _check(first, second, mask)
-    return _mean(jnp.square(first - second), mask)
+    return _squared_error(first, second, mask)
 
 
 @jax.jit
@@ -67,7 +81,7 @@ def psnr(
         TypeError, ValueError: no floating-point array, or shapes that differ.
     """
     _check(first, second, mask)
-    error = _mean(jnp.square(first - second), mask)
+    error = _squared_error(first, second, mask)
     positive = error > 0
     decibels = 10 * jnp.log10(jnp.asarray(peak, error.dtype) ** 2 / jnp.where(positive, error, 1))
     return jnp.where(positive, decibels, jnp.where(jnp.isnan(error), jnp.nan, jnp.inf))
@@ -87,9 +101,17 @@ def _blur(image):
 def ssim_map(
     first: Float[Array, "h w c"], second: Float[Array, "h w c"], *, peak: float | Float[Array, ""] = 1.0
 ) -> Float[Array, "i j 1"]:
-    """SSIM at each pixel that is at least 5 from the border, mean over channels: `[H - 10, W - 10, 1]`.
+    """SSIM at each pixel that is at least 5 from the border, mean over channels; `ssim` is its mean over pixels.
 
-    As `ssim`, whose mean over pixels it is.
+    Args:
+        first, second: `[H, W, C]`, at least 11 x 11.
+        peak: the largest value.
+
+    Returns:
+        `[H - 10, W - 10, 1]`.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, shapes that differ, or images smaller than the window.
     """
     _check(first, second, None)
     height, width, _ = first.shape
@@ -137,6 +159,7 @@ def ssim(
         in the image; as skimage.metrics.structural_similarity(gaussian_weights=True, sigma=1.5,
         use_sample_covariance=False).
     """
+    _check(first, second, mask)
     values = ssim_map(first, second, peak=peak)
     return _mean(values, None if mask is None else mask[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS])
 

@@ -37,8 +37,8 @@ def chain_motion(newer: Float[Array, "h w 2"], older: Float[Array, "h w 2"]) -> 
         `[H, W, 2]` from the newest to the oldest of the three frames.
 
     Edge cases:
-        `older` is interpolated bilinearly; beyond the frame its nearest border vector goes on. Motion that is not finite
-        stays so: NaN or infinite in `newer`, or in an `older` vector that has weight.
+        `older` is interpolated bilinearly; beyond the frame its nearest border vector goes on. Motion that is not
+        finite stays so: NaN or infinite in `newer`, or in an `older` vector that has weight.
 
     Gradient:
         With respect to both, as of `backward_warp`.
@@ -55,9 +55,7 @@ def chain_motion(newer: Float[Array, "h w 2"], older: Float[Array, "h w 2"]) -> 
 
 
 @partial(jax.jit, static_argnames=("sign", "units", "y_axis"))
-def convert_motion(
-    motion: Float[Array, "h w 2"], *, sign: Sign, units: Units, y_axis: YAxis
-) -> Float[Array, "h w 2"]:
+def convert_motion(motion: Float[Array, "h w 2"], *, sign: Sign, units: Units, y_axis: YAxis) -> Float[Array, "h w 2"]:
     """Motion vectors of any engine in the library's convention.
 
     Args:

@@ -32,7 +32,9 @@ def demodulation_divisor(
     """
     check_choice("by", by, _BY)
     size = check_gbuffer("gbuffer", gbuffer)
-    if by == "none" and size is not None:
+    if by == "none":
+        if size is None:
+            raise ValueError("gbuffer: expected a buffer that tells the size, got none")
         return jnp.ones((*size, 3))
     check_present("gbuffer.albedo", gbuffer.albedo, needed_by=f"by={by!r}")
     divisor = gbuffer.albedo
@@ -85,7 +87,17 @@ def modulate(
     by: By = "albedo+specular",
     floor: float | Float[Array, ""] = 1e-2,
 ) -> Float[Array, "h w 3"]:
-    """The inverse of `demodulate` with the same options, to one unit in the last place."""
+    """Radiance with the material's texture again: the inverse of `demodulate` with the same options, to 1 ulp.
+
+    Args:
+        irradiance: `[H, W, 3]`, demodulated radiance. gbuffer, by, floor: as in `demodulate`.
+
+    Returns:
+        `[H, W, 3]` linear radiance.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, a size that differs, an unknown `by`, no albedo.
+    """
     check_gbuffer("gbuffer", gbuffer, size=check_image("irradiance", irradiance, channels=3))
     if by == "none":
         return irradiance
@@ -129,7 +141,9 @@ def tonemap_inverse(display: Float[Array, "*n"], *, gamma: float | Float[Array, 
     """The inverse of `tonemap`: values up to 0 give 0, values from 1 on give infinity."""
     inner = (display > 0) & (display < 1)
     mapped = jnp.where(inner, display, 0.5) ** jnp.asarray(gamma, display.dtype)
-    return jnp.where(inner, mapped / (1 - mapped), jnp.where(display >= 1, jnp.inf, jnp.where(display <= 0, 0, display)))
+    return jnp.where(
+        inner, mapped / (1 - mapped), jnp.where(display >= 1, jnp.inf, jnp.where(display <= 0, 0, display))
+    )
 
 
 @jax.jit

@@ -149,7 +149,7 @@ def _splat(values, motion, weights, *, mode):
     normalised = mode != "sum"
     total = jnp.zeros((count + 1, channels + normalised), wide)
     flat = values.reshape(-1, channels)
-    for (index, share, _), factor in zip(taps, importance):
+    for (index, share, _), factor in zip(taps, importance, strict=False):
         weight = (share * factor)[:, None]
         pushed = weigh(flat, weight)
         if normalised:

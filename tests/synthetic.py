@@ -1,4 +1,4 @@
-"""A small sequence whose motion is exact by construction: a textured wall, a box that moves before it, a panning view."""
+"""A small sequence whose motion is exact by construction: a textured wall, a box moving before it, a panning view."""
 
 import numpy as np
 

@@ -134,27 +134,6 @@ def test_evaluate_goes_on_where_it_was(capsys, dump, tmp_path, monkeypatch):
     assert json.loads((tmp_path / "results.json").read_text())["frames"] == [1, 3, 5, 7]
 
 
-def test_the_truth_does_not_leak(capsys, dump, tmp_path):
-    """Other colours in the held-back frames change the scores, but not what the methods make."""
-    altered = tmp_path / "altered"
-    altered.mkdir()
-    for time in range(6):
-        frame = make_frame(time, SIZE)
-        if time % 2:
-            frame = jx.replace(frame, color=frame.color * 0 + 9)
-        write_unreal_frame(altered, "Wall", time, frame, keyframe=make_keyframe(time, SIZE))
-    images = []
-    for folder, name in ((dump, "a"), (altered, "b")):
-        output = tmp_path / name
-        methods = "warp,occlusion_warp"
-        code, *_ = run(capsys, "evaluate", folder, "--methods", methods, "--output", output, "--frames", 5, "--pictures", 1)
-        assert code == 0
-        pictures = output / "pictures" / "0005"
-        images.append([read_png(pictures / f"{m}.png") for m in methods.split(",")])
-        assert (read_png(pictures / "truth.png") == 243).all() == (name == "b")
-    assert all(np.array_equal(a, b) for a, b in zip(*images))
-
-
 def test_generate_carries_motion_on(capsys, dump, tmp_path):
     code, _, err = run(capsys, "generate", dump, "--method", "warp", "--output", tmp_path, "--factor", 3)
     assert code == 0
@@ -252,7 +231,7 @@ def test_gaps_and_non_finite_pixels(capsys, tmp_path):
             frame = jx.replace(frame, color=color)
         write_unreal_frame(tmp_path, "Wall", time, frame)
     output = tmp_path / "out"
-    code, out, _ = run(capsys, "evaluate", tmp_path, "--methods", "warp", "--output", output, "--pictures", 0)
+    code, _out, _ = run(capsys, "evaluate", tmp_path, "--methods", "warp", "--output", output, "--pictures", 0)
     assert code == 0
     results = json.loads((output / "results.json").read_text())
     assert results["frames"] == [1, 3, 6]

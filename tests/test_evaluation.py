@@ -37,6 +37,27 @@ def test_what_a_method_sees():
         assert w.target.gbuffer.albedo is not None
 
 
+class Altered(SyntheticSequence):
+    """Other colour, shadow and sky colour in the held-back frames."""
+
+    def frame(self, number):
+        frame = super().frame(number)
+        if number % 2 == 0:
+            return frame
+        buffers = jx.replace(frame.gbuffer, shadow=frame.gbuffer.shadow + 1, sky_color=frame.color)
+        return jx.replace(frame, color=frame.color + 9, gbuffer=buffers)
+
+
+def test_the_truth_does_not_leak():
+    for a, b in zip(
+        *(windows(s(range(8)), [5, 7], past=2, future=1) for s in (SyntheticSequence, Altered)), strict=True
+    ):
+        seen = [jax.tree.flatten((w.history, w.target, w.future)) for w in (a, b)]
+        assert seen[0][1] == seen[1][1]
+        assert all(np.array_equal(x, y) for x, y in zip(seen[0][0], seen[1][0], strict=True))
+        assert not np.array_equal(a.truth.color, b.truth.color)
+
+
 def test_windows_see_the_future_of_interpolation():
     (w,) = windows(SyntheticSequence(range(8)), [3], past=1, future=2)
     assert [f.color is None for f in w.future] == [False, True, False]
@@ -125,7 +146,11 @@ def test_pixels_that_were_not_finite_are_not_scored():
 
 def test_means_are_over_frames():
     frames = [
-        {"psnr": 20.0, "ssim": 0.5, "by_cause": {"hole": {"psnr": 10.0, "share": 0.1}, "rest": {"psnr": 30.0, "share": 0.9}}},
+        {
+            "psnr": 20.0,
+            "ssim": 0.5,
+            "by_cause": {"hole": {"psnr": 10.0, "share": 0.1}, "rest": {"psnr": 30.0, "share": 0.9}},
+        },
         {"psnr": 30.0, "ssim": 0.7, "by_cause": {"rest": {"psnr": 40.0, "share": 1.0}}},
     ]
     mean = mean_over_frames(frames)

@@ -117,7 +117,7 @@ def test_equal_costs_go_to_the_first_tap():
     assert guided_taps((1, 3)) == oracles.guided_offsets((1, 3))
 
 
-@pytest.mark.parametrize("sigma", [1e-3, 1e-10, 1e-15])
+@pytest.mark.parametrize("sigma", [1e-3, 1e-10, 1e-20])
 def test_equal_guides_are_weighted_by_distance_at_any_sigma(sigma):
     image, motion, guide, _ = small()
     guide[:] = 0.5
@@ -125,6 +125,14 @@ def test_equal_guides_are_weighted_by_distance_at_any_sigma(sigma):
     np.testing.assert_allclose(
         warp(image, motion, guide, guide, **SMALL, sigma_guide=sigma, sigma_space=1.0), expected, atol=1e-5
     )
+
+
+@pytest.mark.parametrize("sigma", [1e-3, 1e-10, 1e-20])
+def test_a_small_sigma_takes_the_best_tap(sigma):
+    arrays = small()
+    expected, gap = oracles.guided_warp(*arrays, (1,), sigma, 1.0, 3)
+    result = warp(*arrays, **SMALL, sigma_guide=sigma, sigma_space=1.0)
+    np.testing.assert_allclose(result[gap > 1e-4], expected[gap > 1e-4], atol=1e-2 if sigma == 1e-3 else 1e-6)
 
 
 def test_bad_pixels_and_guides():
@@ -183,7 +191,7 @@ def test_gradients_against_differences_of_the_loop(x64):
     oracles.assert_gradients(loss, arrays, [np.asarray(g) for g in found], step=1e-7, rtol=1e-4)
 
 
-@pytest.mark.parametrize("sigma", [0.05, 1e-3, 1e-12])
+@pytest.mark.parametrize("sigma", [0.05, 1e-3, 1e-12, 1e-20])
 def test_gradients_stay_finite(sigma):
     image, motion, target, source = small()
     motion[0, 0], motion[1, 1], motion[2, 2], motion[3, 3] = np.nan, np.inf, 1e6, (0, -1e30)
@@ -194,6 +202,16 @@ def test_gradients_stay_finite(sigma):
         assert np.isfinite(gradient).all()
     for at in ((0, 0), (1, 1), (2, 2), (3, 3)):
         np.testing.assert_array_equal(np.asarray(found[1])[at], 0)
+
+
+@pytest.mark.parametrize("sigma", [1e-3, 1e-12, 1e-20])
+def test_gradients_stay_finite_where_guides_are_equal(sigma):
+    image, motion, guide, _ = small()
+    guide[:] = 0.5
+    arrays = image, motion, guide, guide, np.float32(sigma), np.float32(1)
+    _, found = pullback()(np.ones_like(image), *arrays)
+    for gradient in found:
+        assert np.isfinite(gradient).all()
 
 
 def test_other_sigmas_compile_nothing():

@@ -97,7 +97,10 @@ def test_stages_without_their_buffers_are_left_out(methods):
     assert "modulate" not in stages
     assert "hindsight" not in stages
     assert "guided warp" in stages
-    assert methods["guided_warp"].missing(tuple(bare[:-1]), bare[-1])["demodulate"] == ["history.albedo", "target.albedo"]
+    assert methods["guided_warp"].missing(tuple(bare[:-1]), bare[-1])["demodulate"] == [
+        "history.albedo",
+        "target.albedo",
+    ]
 
 
 def test_a_missing_buffer_is_named(methods):
@@ -173,10 +176,11 @@ def test_plain_share_is_small_where_demodulation_holds():
     assert share.mean() < np.asarray(plain_share(*foggy, motion, by="albedo+specular")).mean()
 
 
-def test_equal_errors_share_nothing():
-    frame = make_frame(3)
-    share = plain_share(frame, frame, jnp.zeros((32, 48, 2)), by="albedo")
-    assert np.isfinite(share).all()
+@pytest.mark.parametrize("name", ["occlusion_warp", "guided_warp"])
+def test_what_stands_still_stays_as_it_is(methods, name):
+    frame = replace(make_frame(3), motion=np.zeros((32, 48, 2), np.float32))
+    assert (np.asarray(plain_share(frame, frame, jnp.zeros((32, 48, 2)), by="albedo")) == 1).all()
+    assert np.array_equal(methods[name]((frame, hide(frame), frame), hide(frame)), frame.color)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (13, 11)])
@@ -197,7 +201,9 @@ def test_the_sky_is_taken_where_the_engine_draws_it(methods):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "least"), [("repeat", 22.8), ("warp", 27.1), ("occlusion_warp", 29.2), ("guided_warp", 30.2)])
+@pytest.mark.parametrize(
+    ("name", "least"), [("repeat", 22.8), ("warp", 27.1), ("occlusion_warp", 29.2), ("guided_warp", 30.2)]
+)
 def test_known_figures_of_a_path_traced_clip(data, name, least):
     from jaxtrapolate.evaluation import arguments, windows
     from jaxtrapolate.files import open_sequence

@@ -63,7 +63,9 @@ def _scan(sequence: Sequence, bar) -> tuple[dict[str, dict[str, Any]], dict[int,
                 continue
             finite = value[np.isfinite(value)]
             low, high = (float(finite.min()), float(finite.max())) if finite.size else (np.nan, np.nan)
-            entry = found.setdefault(name, {"shape": value.shape, "low": low, "high": high, "frames": 0, "constant": True})
+            entry = found.setdefault(
+                name, {"shape": value.shape, "low": low, "high": high, "frames": 0, "constant": True}
+            )
             entry["constant"] &= low == high and entry["low"] == low
             entry["low"], entry["high"] = min(entry["low"], low), max(entry["high"], high)
             entry["frames"] += 1
@@ -96,9 +98,7 @@ def try_conventions(sequence: Sequence, bar) -> list[tuple[MotionConvention, flo
         first, stored = jax.device_put(first), jax.device_put(np.asarray(stored, np.float32))
         truth = display(second, hdr=sequence.hdr)
         for convention, errors in mean_square.items():
-            motion = convert_motion(
-                stored, sign=convention.sign, units=convention.units, y_axis=convention.y_axis
-            )
+            motion = convert_motion(stored, sign=convention.sign, units=convention.units, y_axis=convention.y_axis)
             errors.append(float(psnr(display(backward_warp(first, motion), hdr=sequence.hdr), truth)))
     scored = [(c, float(np.mean(e))) for c, e in mean_square.items() if e]
     return sorted(scored, key=lambda pair: -pair[1])
@@ -132,7 +132,9 @@ def _print_buffers(buffers: dict[str, dict[str, Any]], out: Console) -> None:
     for name, entry in buffers.items():
         size = "x".join(str(s) for s in (entry["shape"][1], entry["shape"][0], entry["shape"][2]))
         remark = "constant" if entry["constant"] else ""
-        table.add_row(name, size, f"{entry['low']:.4g} .. {entry['high']:.4g}", f"{entry['frames']}/{entry['of']}", remark)
+        table.add_row(
+            name, size, f"{entry['low']:.4g} .. {entry['high']:.4g}", f"{entry['frames']}/{entry['of']}", remark
+        )
     out.print(table)
     absent = [n for n in ("color", "motion", *CHANNELS) if n not in buffers]
     if absent:

@@ -34,4 +34,6 @@ def run(options: argparse.Namespace) -> None:
     console = Console(stderr=True)
     results = evaluate(sequence, methods, folder, console=console)
     print_table(results, Console())
-    console.print(f"open {folder / 'report.html'}; numbers in {folder / 'results.json'}", soft_wrap=True, highlight=False)
+    console.print(
+        f"open {folder / 'report.html'}; numbers in {folder / 'results.json'}", soft_wrap=True, highlight=False
+    )

@@ -170,8 +170,8 @@ def _chosen(numbers: list[int], frames: str | None, sequence: Sequence, past: in
     wrong = [n for n in chosen if n not in numbers]
     if wrong or not chosen:
         raise InputError(
-            f"--frames: {', '.join(map(str, wrong)) or 'none'} of {sequence.name} cannot be scored; with {past} rendered "
-            f"frames of history these can: {', '.join(map(str, numbers))}"
+            f"--frames: {', '.join(map(str, wrong)) or 'none'} of {sequence.name} cannot be scored; with {past} "
+            f"rendered frames of history these can: {', '.join(map(str, numbers))}"
         )
     return chosen
 

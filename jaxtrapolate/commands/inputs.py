@@ -63,7 +63,7 @@ def output_folder(text: str) -> Path:
 
 
 def progress(console: Console) -> Progress:
-    """A progress bar on stderr, gone when it is done."""
+    """A progress bar on stderr, gone when it is done; none where stderr is no terminal."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -71,4 +71,5 @@ def progress(console: Console) -> Progress:
         TimeRemainingColumn(),
         console=console,
         transient=True,
+        disable=not console.is_terminal,
     )

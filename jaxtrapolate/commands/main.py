@@ -12,7 +12,8 @@ from jaxtrapolate.files import InputError
 def parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     top = argparse.ArgumentParser(
-        prog="jaxtrapolate", description="Make the frames between rendered frames, and say how good and how fast that is."
+        prog="jaxtrapolate",
+        description="Make the frames between rendered frames, and say how good and how fast that is.",
     )
     top.add_argument("--version", action="version", version=f"jaxtrapolate {__version__}")
     subparsers = top.add_subparsers(required=True, metavar="COMMAND")

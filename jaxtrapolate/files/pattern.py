@@ -52,9 +52,9 @@ import numpy as np
 from jaxtrapolate.files.atomic import os_input_error
 from jaxtrapolate.files.exr import pick, read_exr
 from jaxtrapolate.files.image import decode_srgb, read_png
-from jaxtrapolate.motion import Sign, Units, YAxis
 from jaxtrapolate.files.reader import BUFFERS, FileSequence, Opened, list_folder
 from jaxtrapolate.files.sequence import InputError, MotionConvention
+from jaxtrapolate.motion import Sign, Units, YAxis
 
 SETTINGS_NAME = "jaxtrapolate.toml"
 """The name of the TOML file in a folder of frames."""

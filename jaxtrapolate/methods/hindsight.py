@@ -40,7 +40,8 @@ def plain_share(newest: Frame, previous: Frame, motion: Float[Array, "h w 2"], *
     """How much of a prediction should come from the colour as it is, 0..1, for each block of 8 x 8 pixels of `newest`.
 
     The squared errors of both predictions of `newest` from `previous`, tone mapped and summed over a block, say which
-    was better: share = b^2 / (a^2 + b^2), a the plain one's and b the demodulated one's.
+    was better: share = b^2 / (a^2 + b^2), a the plain one's and b the demodulated one's; 1 where neither errs, so that
+    what stands still stays as it is.
     """
     truth = _display(newest.color)
     plain = backward_warp(previous.color, motion)
@@ -51,7 +52,7 @@ def plain_share(newest: Frame, previous: Frame, motion: Float[Array, "h w 2"], *
         return _blocks(difference[..., :1] + difference[..., 1:2] + difference[..., 2:]) ** 2
 
     a, b = error(plain), error(modulate(demodulated, newest.gbuffer, by=by))
-    return jnp.where(a + b > 0, b / jnp.where(a + b > 0, a + b, 1), 0)
+    return jnp.where(a + b > 0, b / jnp.where(a + b > 0, a + b, 1), 1)
 
 
 def hindsight_stage(by: By = "albedo+specular") -> Stage:
@@ -64,4 +65,6 @@ def hindsight_stage(by: By = "albedo+specular") -> Stage:
         x, y, _ = landing(motion)
         return {"plain_share": sample(share, (x + 0.5) / _BLOCK - 0.5, (y + 0.5) / _BLOCK - 0.5)}
 
-    return Stage("hindsight", function, reads=("history.albedo", "target.albedo", "history.motion"), optional=True, past=2)
+    return Stage(
+        "hindsight", function, reads=("history.albedo", "target.albedo", "history.motion"), optional=True, past=2
+    )

@@ -150,7 +150,7 @@ class Method:
     def step(
         self, carry: Any, history: Frames, target: Frame, future: Frames = ()
     ) -> tuple[Any, Float[Array, "i j 3"]]:
-        """One frame, compiled: `(carry, image)`. Compiles anew only where sizes or the buffers that are there change."""
+        """One frame, compiled: `(carry, image)`; anew only where sizes or the buffers that are there change."""
         return self._jitted(self.state, carry, history, target, future)
 
     def __call__(self, history: Frames, target: Frame, future: Frames = ()) -> Float[Array, "i j 3"]:

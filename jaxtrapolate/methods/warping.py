@@ -30,7 +30,7 @@ def warp() -> Method:
 
 
 def occlusion_warp() -> Method:
-    """The demodulated frame fetched along the motion, in holes along the occluder's (ExtraNet's occlusion composite)."""
+    """The demodulated frame along the motion, in holes along the occluder's (the occlusion composite of ExtraNet)."""
 
     def occlusion(state, values: Values):
         return {"occlusion_motion": occlusion_motion(values["motion"], values["target"].gbuffer.depth)}
