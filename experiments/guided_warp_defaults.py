@@ -77,14 +77,14 @@ def main() -> None:
         print(f"{name}-{seed}", {k: round(v, 2) for k, v in scenes[f"{name}-{seed}"]["methods"].items()}, flush=True)
     moving = [s for n, s in scenes.items() if not n.startswith("still")]  # where nothing moves every dB is beyond 60
     mean = {k: float(np.mean([s["grid"][k] for s in moving])) for k in moving[0]["grid"]}
-    best = max(mean, key=mean.get)
+    bare = {k: float(np.mean([s["bare"][k] for s in moving])) for k in moving[0]["bare"]}
     results = {
         "machine": machine(),
         "size": [height, width],
         "times": times,
         "scenes": scenes,
         "mean": mean,
-        "best": best,
+        "bare": bare,
     }
     with atomic_path(options.output) as temporary:
         temporary.write_text(json.dumps(results, indent=1))

@@ -1,5 +1,7 @@
 """Why a predicted pixel is wrong: the causes by which errors are split; the first that applies counts."""
 
+from typing import cast
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -35,13 +37,14 @@ def disoccluded(target: Keyframe, source: Keyframe) -> Bool[Array, "h w"]:
     Raises:
         TypeError, ValueError: a field is absent, no floating-point array, or of another size.
     """
-    check_present("target.backward_flow", target.backward_flow, needed_by="disoccluded")
-    size = check_image("target.backward_flow", target.backward_flow, channels=3)
+    flow = check_present("target.backward_flow", target.backward_flow, needed_by="disoccluded")
+    size = check_image("target.backward_flow", flow, channels=3)
     check_image("target.depth", target.depth, size=size, channels=1)
     check_image("source.depth", source.depth, size=size, channels=1)
-    motion = target.backward_flow[..., :2]
-    expected = (target.depth + target.backward_flow[..., 2:])[..., 0]
-    found = backward_warp(source.depth, motion)[..., 0]
+    depth, source_depth = cast(Array, target.depth), cast(Array, source.depth)  # `check_image` has refused None
+    motion = flow[..., :2]
+    expected = (depth + flow[..., 2:])[..., 0]
+    found = backward_warp(source_depth, motion)[..., 0]
     return in_frame(motion) & (found < (1 - _HIDDEN) * expected)
 
 

@@ -4,7 +4,7 @@ They read shapes and dtypes only, so they run at trace time, once per compilatio
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,8 @@ import numpy as np
 Size = tuple[int, int]
 ArrayLike = jax.Array | np.ndarray
 """What public functions take for an array; they return JAX arrays."""
+
+T = TypeVar("T")
 
 
 def check_array(name: str, value: Any, *, shape: Sequence[int | str]) -> tuple[int, ...]:
@@ -46,7 +48,8 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
         raise ValueError(f"{name}: expected one of {', '.join(repr(c) for c in choices)}, got {value!r}")
 
 
-def check_present(name: str, value: Any, *, needed_by: str) -> None:
-    """Raise `ValueError` where a buffer that is needed is absent (`None`)."""
+def check_present(name: str, value: T | None, *, needed_by: str) -> T:
+    """`value`, after checking that it is not absent: `ValueError` where a buffer that is needed is `None`."""
     if value is None:
         raise ValueError(f"{name}: absent (None), but {needed_by} needs it")
+    return value

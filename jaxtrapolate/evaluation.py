@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrapolate.causes import CAUSES, cause_map, disoccluded
-from jaxtrapolate.checks import ArrayLike
+from jaxtrapolate.checks import ArrayLike, check_present
 from jaxtrapolate.files import Sequence, prefetch, runs
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.metrics import psnr, ssim
@@ -87,24 +87,26 @@ def display(color: Float[ArrayLike, "h w 3"], *, hdr: bool) -> Float[Array, "h w
 def causes_of(sequence: Sequence, window: Window) -> np.ndarray:
     """The `cause_map` of a window: exact holes where the sequence knows its 3D flow, else by the hole masks."""
     target, source = sequence.keyframe(window.number), sequence.keyframe(window.number - 1)
-    hidden = None
-    exact = target is not None and source is not None and sequence.depth == "metric"
-    if exact and target.backward_flow is not None and source.depth is not None:
-        hidden = disoccluded(replace(target, color=None), replace(source, color=None))
-    source = window.history[-1]
-    metric = sequence.depth == "metric"
-    return np.asarray(cause_map(window.truth, source, window.target.motion, hidden=hidden, metric_depth=metric))
+    hidden, metric = None, sequence.depth == "metric"
+    if metric and target is not None and source is not None:
+        exact = target.backward_flow is not None and source.depth is not None
+        hidden = disoccluded(replace(target, color=None), replace(source, color=None)) if exact else None
+    motion = check_present("target.motion", window.target.motion, needed_by="causes_of")
+    return np.asarray(cause_map(window.truth, window.history[-1], motion, hidden=hidden, metric_depth=metric))
 
 
 def score(image: Array, window: Window, causes: np.ndarray | None, invalid: np.ndarray | None, *, hdr: bool) -> dict:
     """PSNR and SSIM of a made frame, whole and by cause; pixels that were not finite in the input are left out."""
-    made, truth = display(image, hdr=hdr), display(window.truth.color, hdr=hdr)
+    color = check_present("truth.color", window.truth.color, needed_by="score")
+    made, truth = display(image, hdr=hdr), display(color, hdr=hdr)
     valid = np.ones((*made.shape[:2], 1), bool) if invalid is None else ~invalid[..., None]
     result: dict[str, Any] = {"number": window.number, "psnr": float(psnr(made, truth, mask=valid)), "ssim": None}
     if min(made.shape[:2]) >= 11:
         result["ssim"] = float(ssim(made, truth, mask=valid))
     result["by_cause"] = {}
-    for i, cause in enumerate(CAUSES if causes is not None else ()):
+    if causes is None:
+        return result
+    for i, cause in enumerate(CAUSES):
         mask = (causes[..., None] == i) & valid
         if mask.any():
             decibels = float(psnr(made, truth, mask=mask))

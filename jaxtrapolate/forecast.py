@@ -34,12 +34,12 @@ def forecast(frame: Frame, fraction: float | Float[Array, ""]) -> Frame:
         TypeError, ValueError: no motion, or buffers whose sizes differ.
     """
     check_frame("frame", frame)
-    check_present("frame.motion", frame.motion, needed_by="forecast")
-    onward = -fraction * frame.motion
+    back = check_present("frame.motion", frame.motion, needed_by="forecast")
+    onward = -fraction * back
     depth = None if frame.gbuffer is None else frame.gbuffer.depth
-    depth = jnp.zeros_like(frame.motion[..., :1]) if depth is None else depth
+    depth = jnp.zeros_like(back[..., :1]) if depth is None else depth
     landed, covered = splat_nearest(-onward, onward, depth)
-    motion = jnp.where(covered[..., None], landed, fraction * frame.motion)
+    motion = jnp.where(covered[..., None], landed, fraction * back)
     buffers = frame.gbuffer
     if buffers is not None:
         buffers = replace(buffers, shadow=None, sky_color=None)

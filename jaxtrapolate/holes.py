@@ -2,7 +2,7 @@
 
 import dataclasses
 from functools import partial, reduce
-from typing import Literal
+from typing import Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +42,8 @@ class HoleMasks:
 
 def _dot(a, b):
     """The inner product over channels, `[H, W, 1]`; written out, because XLA's loops over three numbers are slow."""
-    return sum(a[..., k : k + 1] * b[..., k : k + 1] for k in range(a.shape[-1]))
+    terms = (a[..., k : k + 1] * b[..., k : k + 1] for k in range(a.shape[-1]))
+    return cast(Array, sum(terms))  # there is a channel, so that it is not the int 0
 
 
 def _root(squared):

@@ -3,6 +3,8 @@
 Both compare display values in 0..1: see `jaxtrapolate.tonemap` and `srgb_encode`.
 """
 
+from typing import cast
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -93,7 +95,8 @@ def _blur(image):
     kernel = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
     kernel = kernel / kernel.sum()
     height, width, _ = image.shape
-    rows = sum(float(w) * image[k : k + height - 2 * _RADIUS] for k, w in enumerate(kernel))
+    terms = (float(w) * image[k : k + height - 2 * _RADIUS] for k, w in enumerate(kernel))
+    rows = cast(Array, sum(terms))  # the kernel is not empty, so that it is not the int 0
     return sum(float(w) * rows[:, k : k + width - 2 * _RADIUS] for k, w in enumerate(kernel))
 
 

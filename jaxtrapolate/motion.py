@@ -6,7 +6,7 @@ Convention:
 """
 
 from functools import partial
-from typing import Literal
+from typing import Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -87,7 +87,8 @@ def convert_motion(motion: Float[Array, "h w 2"], *, sign: Sign, units: Units, y
 
 def _project(camera: Camera, points: Array, height: int, width: int) -> tuple[Array, Array]:
     """Pixel coordinates `[..., 2]` of homogeneous world points `[..., 4]`, and whether they lie before the camera."""
-    clip = points @ (camera.projection @ camera.view).T
+    view, projection = cast(Array, camera.view), cast(Array, camera.projection)  # `check_camera` has refused None
+    clip = points @ (projection @ view).T
     w = clip[..., 3:]
     ahead = w > 0
     ndc = clip[..., :2] / jnp.where(ahead, w, 1)

@@ -36,8 +36,7 @@ def demodulation_divisor(
         if size is None:
             raise ValueError("gbuffer: expected a buffer that tells the size, got none")
         return jnp.ones((*size, 3))
-    check_present("gbuffer.albedo", gbuffer.albedo, needed_by=f"by={by!r}")
-    divisor = gbuffer.albedo
+    divisor = check_present("gbuffer.albedo", gbuffer.albedo, needed_by=f"by={by!r}")
     if by == "albedo+specular" and gbuffer.specular is not None:
         dielectric = 1.0 if gbuffer.metallic is None else 1 - gbuffer.metallic
         divisor = divisor + 0.08 * gbuffer.specular * dielectric

@@ -206,7 +206,7 @@ def splat(
     check_image("motion", motion, size=size, channels=2)
     check_choice("mode", mode, _MODES)
     if mode in ("linear", "softmax"):
-        check_present("weights", weights, needed_by=f"mode={mode!r}")
+        weights = check_present("weights", weights, needed_by=f"mode={mode!r}")
         check_image("weights", weights, size=size, channels=1)
         finite = jnp.isfinite(weights)
         motion = jnp.where(finite, motion, jnp.nan)

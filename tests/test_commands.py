@@ -286,3 +286,33 @@ def test_render_check_and_demo(capsys, tmp_path):
     results = json.loads((tmp_path / "demo" / "results.json").read_text())
     assert results["methods"]["guided_warp"]["psnr"] > results["methods"]["warp"]["psnr"]
     assert (tmp_path / "demo" / "report.html").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["czest1dm", "bunker"])
+@pytest.mark.parametrize("change", ["as it is", "negated", "flipped", "other units"])
+def test_check_finds_the_convention_of_real_input(data, name, change):
+    """The best of all conventions is the stated one, and what it becomes when the stored vectors are altered."""
+    from rich.console import Console
+
+    from jaxtrapolate.commands.check import try_conventions
+    from jaxtrapolate.commands.inputs import progress
+    from jaxtrapolate.files import MotionConvention, open_sequence
+
+    sequence = open_sequence(data / name)
+    height, width = sequence.size
+    stated, stored = sequence.convention, sequence.stored_motion
+    other = "uv" if stated.units == "pixels" else "pixels"
+    scale = np.float32([width, height]) ** (1 if other == "pixels" else -1)
+    factor, expected = {
+        "as it is": (np.float32([1, 1]), str(stated)),
+        "negated": (np.float32([-1, -1]), "previous_minus_current"),
+        "flipped": (np.float32([1, -1]), "down"),
+        "other units": (scale, other),
+    }[change]
+    sequence.stored_motion = lambda number: stored(number) * factor
+    with progress(Console(stderr=True)) as bar:
+        tried = try_conventions(sequence, bar)
+    assert len(tried) == 12
+    assert tried[0][0] == MotionConvention.parse(expected, base=stated)
+    assert tried[0][1] > tried[1][1] + 1

@@ -70,7 +70,7 @@ def test_half_clips_finite_values_only(tmp_path):
     np.testing.assert_array_equal(read_exr(path)["Y"], [[HALF_MAX, -HALF_MAX, np.inf, np.nan]])
 
 
-def test_unknown_compression(tmp_path):
+def test_unknown_compression(unchecked, tmp_path):
     with pytest.raises(ValueError, match="compression: expected one of 'none', 'rle'"):
         write_exr(tmp_path / "a.exr", image(2, 2), compression="best")
 

@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrapolate.checks import check_present
 from jaxtrapolate.commands.inputs import output_folder
 from jaxtrapolate.evaluation import Window, arguments, causes_of, display
 from jaxtrapolate.files import Sequence, write_png
@@ -42,13 +43,15 @@ def write_pictures(sequence: Sequence, window: Window, methods: dict[str, Method
         write_png(place / f"{name}.png", codes)
         return (place / f"{name}.png").relative_to(folder).as_posix()
 
-    truth = np.asarray(display(window.truth.color, hdr=sequence.hdr))
+    color = check_present("truth.color", window.truth.color, needed_by="write_pictures")
+    truth = np.asarray(display(color, hdr=sequence.hdr))
     newest = window.history[-1]
+    newest_color = check_present("history[-1].color", newest.color, needed_by="write_pictures")
     here, there = window.target.gbuffer or GBuffer(), newest.gbuffer or GBuffer()
     pictures: dict[str, Any] = {
         "number": window.number,
         "truth": put("truth", eight_bit(truth)),
-        "previous": put("previous", eight_bit(display(newest.color, hdr=sequence.hdr))),
+        "previous": put("previous", eight_bit(display(newest_color, hdr=sequence.hdr))),
         "causes": put("causes", colorize_causes(causes_of(sequence, window))),
         "methods": {},
         "buffers": {},

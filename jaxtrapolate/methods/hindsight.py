@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxtrapolate.checks import check_present
 from jaxtrapolate.gather import backward_warp, landing, sample
 from jaxtrapolate.methods.method import Stage, Values, rendered
 from jaxtrapolate.methods.stages import chain
@@ -43,9 +44,10 @@ def plain_share(newest: Frame, previous: Frame, motion: Float[Array, "h w 2"], *
     was better: share = b^2 / (a^2 + b^2), a the plain one's and b the demodulated one's; 1 where neither errs, so that
     what stands still stays as it is.
     """
-    truth = _display(newest.color)
-    plain = backward_warp(previous.color, motion)
-    demodulated = backward_warp(demodulate(previous.color, previous.gbuffer, by=by), motion)
+    truth = _display(check_present("newest.color", newest.color, needed_by="plain_share"))
+    color = check_present("previous.color", previous.color, needed_by="plain_share")
+    plain = backward_warp(color, motion)
+    demodulated = backward_warp(demodulate(color, previous.gbuffer, by=by), motion)
 
     def error(image):
         difference = jnp.square(_display(image) - truth)

@@ -24,10 +24,10 @@ def chain(frames: Sequence[Frame], first: int, last: int) -> Array:
     """Motion from frames[first] to the older frames[last], through the motion of all frames between."""
     total = None
     for i in range(first, last, -1):
-        motion = frames[i].motion
-        check_present(f"frame {i - len(frames) + 1} before the target: motion", motion, needed_by="the chain of motion")
+        name = f"frame {i - len(frames) + 1} before the target: motion"
+        motion = check_present(name, frames[i].motion, needed_by="the chain of motion")
         total = motion if total is None else chain_motion(total, motion)
-    return total
+    return check_present(f"motion from frame {first} to the older frame {last}", total, needed_by="the warp")
 
 
 def _reproject(state, values: Values):

@@ -8,7 +8,7 @@ which primitive it leaves (`own`).
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -193,7 +193,8 @@ def openness(placed: Placed, p: Vector, normal: Vector, own: Array, heights: tup
 
     def free(distance: Callable[[Vector], Array]) -> Array:
         parts = [jnp.clip(distance(point) / height, 0.0, 1.0) for point, height in zip(points, heights, strict=True)]
-        return 0.25 + 0.75 * sum(parts) / len(parts)
+        total = cast(Array, sum(parts))  # `heights` is not empty, so that it is not the int 0
+        return 0.25 + 0.75 * total / len(parts)
 
     def step(kind: str, state: Array, row: tuple) -> Array:
         counts = (row[3] > 0) & (row[4] != own)

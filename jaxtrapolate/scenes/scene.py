@@ -6,13 +6,14 @@ and can be stacked for `vmap`.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxtrapolate.records import record
+from jaxtrapolate.records import R, record
 from jaxtrapolate.scenes.field import HeightField
 from jaxtrapolate.scenes.kinematics import HARMONICS, Bodies, Path, Turn
 from jaxtrapolate.scenes.primitives import KINDS
@@ -251,7 +252,7 @@ class Builder:
             raise ValueError(f"a scene holds at most {LIMIT} primitives, got {len(rows)}")
         surfaces = [row[3] for row in rows] + ([] if self._field is None else [self._field[1]])
         direction = _array(sun_direction, (3,))
-        lamps = {
+        lamps: dict[str, Any] = {  # NumPy's until the end, where the fields are JAX's
             name: np.asarray([lamp[k + 1] for lamp in self._lamps], np.float32)
             for k, name in enumerate(("lamp_color", "lamp_radius", "lamp_flicker", "lamp_period", "lamp_duty"))
         }
@@ -287,7 +288,7 @@ class Builder:
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), result)
 
 
-def _stack(values: list, example: object) -> object:
+def _stack(values: list[R], example: R) -> R:
     if not values:
         return jax.tree.map(lambda leaf: np.zeros((0, *np.shape(leaf)), np.float32), example)
     return jax.tree.map(lambda *leaves: np.stack(leaves).astype(np.float32), *values)

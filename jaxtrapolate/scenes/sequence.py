@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from jaxtrapolate.files.sequence import MotionConvention, Sequence
-from jaxtrapolate.records import Frame, Keyframe
+from jaxtrapolate.records import Frame, Keyframe, R
 from jaxtrapolate.scenes.library import scene
 from jaxtrapolate.scenes.render import keyframe, render, visible
 
@@ -67,5 +67,5 @@ class SceneSequence(Sequence):
             raise ValueError(f"number: expected {self.numbers[0]} to {self.numbers[-1]}, got {number}")
 
 
-def _arrays(value: Frame | Keyframe) -> Frame | Keyframe:
-    return jax.tree.map(np.asarray, value)  # type: ignore[return-value]
+def _arrays(value: R) -> R:
+    return jax.tree.map(np.asarray, value)

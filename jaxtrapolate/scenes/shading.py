@@ -10,7 +10,7 @@ References: Karis, "Real Shading in Unreal Engine 4" (2013) and "Physically Base
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -238,7 +238,7 @@ def direct_light(
     with_all, with_static = jnp.zeros_like(s.width), jnp.zeros_like(s.width)
 
     def luminance(color: Array) -> Array:
-        return sum(weight * color[k] for k, weight in enumerate(_LUMINANCE))
+        return cast(Array, sum(weight * color[k] for k, weight in enumerate(_LUMINANCE)))
 
     def add(to: Vector, color: Array, falloff: Array, *, near: bool, softness: Array) -> None:
         nonlocal total, with_all, with_static

@@ -1,5 +1,7 @@
 """What several scenes share: skies, surfaces, camera paths, figures and trees."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from jaxtrapolate.scenes.kinematics import Path
@@ -79,7 +81,9 @@ def camera(eye: Path, target: Path, *, degrees: float = 50.0, roll: float = 0.0)
     return CameraPath(eye, target, np.float32(roll), np.float32(np.tan(np.radians(degrees) / 2)))  # type: ignore[arg-type]
 
 
-def spots(rng: Generator, count: int, low: object, high: object, apart: float | int) -> np.ndarray:
+def spots(
+    rng: Generator, count: int, low: Sequence[float | int], high: Sequence[float | int], apart: float | int
+) -> np.ndarray:
     """Points `[count, 2]` in a rectangle, no two nearer than `apart` if that can be had, by best candidate."""
     points = [rng.uniform(low, high)]
     while len(points) < count:
@@ -121,16 +125,16 @@ def walker(
     builder.add("sphere", (0.02 * s, 0, 0.72 * s), (0.115 * s, 0.1 * s, 0.14 * s), skin, body=chest)
     builder.add("sphere", (0, 0, 0.02 * s), (0.14 * s, 0.17 * s, 0.13 * s), legs, body=hips)
     for side in (-1, 1):
-        swing = dict(frequency=[stride], phase=[phase + (0.5 if side > 0 else 0.0)])
-        leg = builder.body(path((0, 0.1 * side * s, 0)), turn((0, 1, 0), amplitude=[0.55], **swing), parent=hips)
+        swing = phase + (0.5 if side > 0 else 0.0)
+        hip = turn((0, 1, 0), amplitude=[0.55], frequency=[stride], phase=[swing])
+        leg = builder.body(path((0, 0.1 * side * s, 0)), hip, parent=hips)
         builder.limb((0, 0, 0), (0, 0, -0.42 * s), 0.085 * s, legs, body=leg)
-        bend = dict(frequency=[stride], phase=[phase + (0.5 if side > 0 else 0.0) + 0.2])
-        shin = builder.body(path((0, 0, -0.42 * s)), turn((0, 1, 0), angle=0.42, amplitude=[0.4], **bend), parent=leg)
+        knee = turn((0, 1, 0), angle=0.42, amplitude=[0.4], frequency=[stride], phase=[swing + 0.2])
+        shin = builder.body(path((0, 0, -0.42 * s)), knee, parent=leg)
         builder.limb((0, 0, 0), (0, 0, -0.4 * s), 0.065 * s, legs, body=shin)
-        back = dict(frequency=[stride], phase=[phase + (0.0 if side > 0 else 0.5)])
-        arm = builder.body(
-            path((0, 0.23 * side * s, 0.4 * s)), turn((0, 1, 0), angle=-0.15, amplitude=[0.6], **back), parent=chest
-        )
+        back = phase + (0.0 if side > 0 else 0.5)
+        shoulder = turn((0, 1, 0), angle=-0.15, amplitude=[0.6], frequency=[stride], phase=[back])
+        arm = builder.body(path((0, 0.23 * side * s, 0.4 * s)), shoulder, parent=chest)
         builder.limb((0, 0, 0), (0, 0.03 * side * s, -0.28 * s), 0.055 * s, cloth, body=arm)
         builder.limb((0, 0.03 * side * s, -0.28 * s), (0.16 * s, 0.02 * side * s, -0.46 * s), 0.045 * s, skin, body=arm)
     return base
@@ -148,12 +152,20 @@ def going_round(
     return builder.body(sway, turn(angle=ahead), parent=hub), phase
 
 
-def striding(builder: Builder, rng: Generator, *, radius: float, speed: float, stencil: int, **options: object) -> None:
+def striding(
+    builder: Builder,
+    rng: Generator,
+    *,
+    radius: float,
+    speed: float,
+    stencil: int,
+    centre: object = (0, 0, 0),
+    scale: float = 1.0,
+) -> None:
     """A figure that walks or runs round a centre at about `speed` metres a frame."""
     period = 2 * np.pi * radius / speed * (1 if rng.uniform() < 0.5 else -1)
-    centre = options.pop("centre", (0, 0, 0))
     body, _ = going_round(builder, rng, radius=radius, period=period, stencil=stencil, centre=centre)
-    walker(builder, rng, parent=body, stencil=stencil, stride=speed / 1.5, **options)  # type: ignore[arg-type]
+    walker(builder, rng, parent=body, stencil=stencil, stride=speed / 1.5, scale=scale)
 
 
 def crown(builder: Builder, rng: Generator, place: object, radii: object, color: object) -> None:
