@@ -84,14 +84,19 @@ def display(color: Float[ArrayLike, "h w 3"], *, hdr: bool) -> Float[Array, "h w
     return tonemap(color) if hdr else srgb_encode(jnp.clip(color, 0, 1))
 
 
-def causes_of(sequence: Sequence, window: Window) -> np.ndarray:
-    """The `cause_map` of a window: exact holes where the sequence knows its 3D flow, else by the hole masks."""
+def causes_of(sequence: Sequence, window: Window) -> np.ndarray | None:
+    """The `cause_map` of a window: exact holes where the sequence knows its 3D flow, else by the hole masks.
+
+    `None` without motion vectors.
+    """
+    motion = window.target.motion
+    if motion is None:
+        return None
     target, source = sequence.keyframe(window.number), sequence.keyframe(window.number - 1)
     hidden, metric = None, sequence.depth == "metric"
     if metric and target is not None and source is not None:
         exact = target.backward_flow is not None and source.depth is not None
         hidden = disoccluded(replace(target, color=None), replace(source, color=None)) if exact else None
-    motion = check_present("target.motion", window.target.motion, needed_by="causes_of")
     return np.asarray(cause_map(window.truth, window.history[-1], motion, hidden=hidden, metric_depth=metric))
 
 

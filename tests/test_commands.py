@@ -222,6 +222,21 @@ def test_what_misses_buffers_is_left_out_by_name(capsys, clip, tmp_path):
     assert "target.depth" in json.loads((tmp_path / "results.json").read_text())["skipped"]["occlusion_warp"]
 
 
+def test_colour_alone_is_enough_to_repeat(capsys, tmp_path):
+    (tmp_path / "color").mkdir()
+    for time in range(4):
+        codes = np.full((*SIZE, 3), 40 * time, np.uint8)
+        write_png(tmp_path / "color" / f"{time:04d}.png", codes)
+    output = tmp_path / "out"
+    code, out, _ = run(capsys, "evaluate", tmp_path, "--methods", "repeat,warp", "--output", output, "--pictures", 1)
+    assert code == 0
+    assert "missing target.motion" in out
+    results = json.loads((output / "results.json").read_text())
+    assert results["methods"]["repeat"]["psnr"] == pytest.approx(20 * np.log10(255 / 40), abs=1e-3)
+    assert results["methods"]["repeat"]["by_cause"] == {}
+    assert run(capsys, "check", tmp_path)[0] == 0
+
+
 def test_gaps_and_non_finite_pixels(capsys, tmp_path):
     for time in (0, 1, 2, 3, 5, 6, 7):
         frame = make_frame(time, SIZE)

@@ -22,14 +22,18 @@ def eight_bit(image: Any) -> np.ndarray:
     return np.repeat(codes, 3, -1) if codes.shape[-1] == 1 else codes
 
 
-def buffer_picture(name: str, value: Any) -> np.ndarray:
-    """A buffer as a picture: normals from -1..1, what has no range of its own between its 1st and 99th percentile."""
+def buffer_picture(name: str, value: Any, sky: Any = None) -> np.ndarray:
+    """A buffer as a picture: normals from -1..1, what has no range of its own between its 1st and 99th percentile.
+
+    Where there is a sky its far values do not count for the range.
+    """
     value = np.asarray(value, np.float32)
     if name == "normal":
         return eight_bit(value * 0.5 + 0.5)
     if name in ("depth", "position", "stencil"):
-        finite = np.where(np.isfinite(value), value, np.nan)
-        low, high = np.nanpercentile(finite, (1, 99), axis=(0, 1)) if np.isfinite(value).any() else (0.0, 1.0)
+        counts = np.isfinite(value) if sky is None or name == "stencil" else np.isfinite(value) & (np.asarray(sky) < 0.5)
+        finite = np.where(counts, value, np.nan)
+        low, high = np.nanpercentile(finite, (1, 99), axis=(0, 1)) if counts.any() else (0.0, 1.0)
         high = np.maximum(high, value.max(axis=(0, 1))) if name == "stencil" else high
         return eight_bit((np.nan_to_num(value) - low) / np.maximum(high - low, 1e-6))
     return eight_bit(value)
@@ -52,10 +56,12 @@ def write_pictures(sequence: Sequence, window: Window, methods: dict[str, Method
         "number": window.number,
         "truth": put("truth", eight_bit(truth)),
         "previous": put("previous", eight_bit(display(newest_color, hdr=sequence.hdr))),
-        "causes": put("causes", colorize_causes(causes_of(sequence, window))),
         "methods": {},
         "buffers": {},
     }
+    causes = causes_of(sequence, window)
+    if causes is not None:
+        pictures["causes"] = put("causes", colorize_causes(causes))
     if window.target.motion is not None:
         holes = hole_masks(here, there, window.target.motion).any
         pictures["holes"] = put("holes", eight_bit(jnp.where(holes, jnp.array([0.1, 0.9, 0.2]), truth * 0.5)))
@@ -71,7 +77,7 @@ def write_pictures(sequence: Sequence, window: Window, methods: dict[str, Method
         value = getattr(shown, name)
         if value is not None:
             picture = display(value, hdr=True) if name == "sky_color" else value
-            pictures["buffers"][name] = put(f"buffer_{name}", buffer_picture(name, picture))
+            pictures["buffers"][name] = put(f"buffer_{name}", buffer_picture(name, picture, shown.sky))
     if window.truth.motion is not None:
         motion = np.asarray(window.truth.motion)
         largest = max(float(np.nanpercentile(np.abs(motion), 99)), 1e-3)
