@@ -12,7 +12,7 @@ from jaxtrapolate.checks import ArrayLike, check_choice, check_image
 from jaxtrapolate.gather import backward_warp, cell, inside, landing, sample, take_offsets
 from jaxtrapolate.records import GBuffer, check_gbuffer, record
 
-Taps = Literal["weighted", "release"]
+Taps = Literal["weighted", "nearest", "release"]
 
 
 @record
@@ -66,9 +66,11 @@ def _footprint(position):
     return jnp.zeros_like(position[..., :1]) if result is None else _root(result)
 
 
-def _taps(image, x, y):
-    """The four pixels around each landing place and their weights `[H, W, 1]`."""
+def _taps(image, x, y, taps):
+    """The pixels that count around each landing place and their weights `[H, W, 1]`; one, or four."""
     height, width, _ = image.shape
+    if taps == "nearest":
+        return [(sample(image, x, y, filter="nearest"), jnp.ones((*x.shape, 1), x.dtype))]
     column, t = cell(x, width)
     row, u = cell(y, height)
     t, u = t[..., None], u[..., None]
@@ -101,7 +103,7 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
         other = jnp.zeros_like(target.stencil)
         differs = jnp.zeros(outside.shape, bool)
         moving = jnp.zeros(outside.shape, bool)
-        for ids, weight in _taps(source.stencil, x, y):
+        for ids, weight in _taps(source.stencil, x, y, taps):
             another = jnp.round(ids) != jnp.round(target.stencil)
             other = other + jnp.where(another, weight, 0)
             differs |= another & (weight > 0)
@@ -113,11 +115,12 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
 
     normal = None
     if both["normal"]:
-        warped = backward_warp(source.normal, motion, outside="zero")
+        filter = "nearest" if taps == "nearest" else "bilinear"
+        warped = backward_warp(source.normal, motion, filter=filter, outside="zero")
         here, there = _dot(target.normal, target.normal), _dot(warped, warped)
         concerned = dynamic & ((here > 0) | (there > 0))
         cosine = _dot(target.normal, warped)
-        if taps == "weighted":  # the mean of unit vectors is shorter than they are
+        if taps != "release":  # the mean of unit vectors is shorter than they are
             lengths = here * there
             cosine = jnp.where(lengths > 0, cosine / jnp.sqrt(jnp.where(lengths > 0, lengths, 1)), 0)
             concerned &= seen
@@ -137,11 +140,11 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
         if target.depth is not None:
             limit = limit + jnp.where(jnp.isfinite(target.depth), per_depth * jnp.abs(target.depth), 0)
         farthest = jnp.zeros(outside.shape, target.position.dtype)
-        for place, weight in _taps(source.position, x, y):
+        for place, weight in _taps(source.position, x, y, taps):
             known = _dot(place, place) + _dot(target.position, target.position) < jnp.inf
             apart = jnp.where(known, place - target.position, 0)
             squared = jnp.where(known, _dot(apart, apart), jnp.inf)
-            if taps == "weighted":
+            if taps != "release":
                 squared = jnp.where(weight > 0, squared, 0)
             farthest = jnp.maximum(farthest, squared)
         if taps == "release":
@@ -187,16 +190,17 @@ def hole_masks(
         target, source: the G-buffers of the frame to be made and of the one that is warped.
         motion: `[H, W, 2]` from target to source.
         taps: "weighted" looks only at those of the four bilinear taps that have weight, so that a frame warped onto
-            itself has no holes; ids are compared, not their mean. "release" does as the authors': the bilinear mean of
-            the ids, more than 1/3 off; the largest distance over all four taps; everything outside is a hole of
-            position as well.
+            itself has no holes; ids are compared, not their mean. "nearest" looks at the nearest pixel alone: the
+            pixels beside a silhouette, of whose taps one is wrong, are then no holes. "release" does as the authors':
+            the bilinear mean of the ids, more than 1/3 off; the largest distance over all four taps; everything
+            outside is a hole of position as well.
         softness: 0 gives bool masks. Above 0 they are in 0..1 and differentiable: a sigmoid of the excess over the
             threshold, relative to it, over softness; the stencil's is the weight of the taps with another id.
         normal_threshold: T_n, a cosine.
         position_threshold: a number: how many times the distance between neighbouring pixels' positions (the larger of
             the two axes), plus 0.1 % of the depth, so that it needs no unit. Or (facing, grazing, per_depth): T_d =
-            facing |n_dot_v| + grazing (1 - |n_dot_v|) + per_depth * depth in the scene's unit. `None`: 2.0 for
-            "weighted", the release's (7.5, 45, 0.005) in centimetres for "release".
+            facing |n_dot_v| + grazing (1 - |n_dot_v|) + per_depth * depth in the scene's unit. `None`: 2.0, but
+            the release's (7.5, 45, 0.005) in centimetres for "release".
 
     Returns:
         `HoleMasks` of `[H, W, 1]`.
@@ -218,7 +222,7 @@ def hole_masks(
     size = check_image("motion", motion, channels=2)
     check_gbuffer("target", target, size=size)
     check_gbuffer("source", source, size=size)
-    check_choice("taps", taps, ("weighted", "release"))
+    check_choice("taps", taps, ("weighted", "nearest", "release"))
     if position_threshold is None:
         position_threshold = _RELEASE if taps == "release" else 2.0
     soft = not (isinstance(softness, (int, float)) and softness == 0)

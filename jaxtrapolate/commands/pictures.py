@@ -31,7 +31,9 @@ def buffer_picture(name: str, value: Any, sky: Any = None) -> np.ndarray:
     if name == "normal":
         return eight_bit(value * 0.5 + 0.5)
     if name in ("depth", "position", "stencil"):
-        counts = np.isfinite(value) if sky is None or name == "stencil" else np.isfinite(value) & (np.asarray(sky) < 0.5)
+        counts = np.isfinite(value)
+        if sky is not None and name != "stencil":
+            counts = counts & (np.asarray(sky) < 0.5)
         finite = np.where(counts, value, np.nan)
         low, high = np.nanpercentile(finite, (1, 99), axis=(0, 1)) if counts.any() else (0.0, 1.0)
         high = np.maximum(high, value.max(axis=(0, 1))) if name == "stencil" else high

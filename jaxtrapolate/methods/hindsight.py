@@ -21,13 +21,20 @@ from jaxtrapolate.radiance import By, demodulate, modulate
 from jaxtrapolate.records import Frame
 
 _BLOCK = 8  # pixels, the side of the blocks over which errors are averaged
+_MARGIN = 2  # the plain prediction must be better by this factor of the squared error to make up half
 
 
 def _blocks(image: Float[Array, "h w 1"]) -> Float[Array, "i j 1"]:
-    """Sums over blocks of pixels; those at the right and lower border may be smaller."""
+    """Sums over blocks of pixels; those at the right and lower border may be smaller.
+
+    As two matrix products: XLA does not fuse them with what makes the image, which a CPU then does in vectors.
+    """
     height, width, _ = image.shape
-    padded = jnp.pad(image, ((0, -height % _BLOCK), (0, -width % _BLOCK), (0, 0)))
-    return padded.reshape(-(-height // _BLOCK), _BLOCK, -(-width // _BLOCK), _BLOCK).sum((1, 3))[..., None]
+
+    def member(size):
+        return (jnp.arange(size)[:, None] // _BLOCK == jnp.arange(-(-size // _BLOCK))[None]).astype(image.dtype)
+
+    return (member(height).T @ (image[..., 0] @ member(width)))[..., None]
 
 
 def _display(color):
@@ -41,8 +48,9 @@ def plain_share(newest: Frame, previous: Frame, motion: Float[Array, "h w 2"], *
     """How much of a prediction should come from the colour as it is, 0..1, for each block of 8 x 8 pixels of `newest`.
 
     The squared errors of both predictions of `newest` from `previous`, tone mapped and summed over a block, say which
-    was better: share = b^2 / (a^2 + b^2), a the plain one's and b the demodulated one's; 1 where neither errs, so that
-    what stands still stays as it is.
+    was better: share = b^2 / ((2 a)^2 + b^2), a the plain one's and b the demodulated one's; 1 where neither errs, so
+    that what stands still stays as it is. The margin of 2 is for what the methods add to demodulation; on embedded
+    scenes it gives the guided warp 0.4-0.5 dB, and costs the occlusion warp 0.2-0.4 dB.
     """
     truth = _display(check_present("newest.color", newest.color, needed_by="plain_share"))
     color = check_present("previous.color", previous.color, needed_by="plain_share")
@@ -53,7 +61,7 @@ def plain_share(newest: Frame, previous: Frame, motion: Float[Array, "h w 2"], *
         difference = jnp.square(_display(image) - truth)
         return _blocks(difference[..., :1] + difference[..., 1:2] + difference[..., 2:]) ** 2
 
-    a, b = error(plain), error(modulate(demodulated, newest.gbuffer, by=by))
+    a, b = error(plain) * _MARGIN**2, error(modulate(demodulated, newest.gbuffer, by=by))
     return jnp.where(a + b > 0, b / jnp.where(a + b > 0, a + b, 1), 1)
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.gather import backward_warp, landing, pixel_grid
+from jaxtrapolate.gather import backward_warp
 from jaxtrapolate.holes import hole_masks
 from jaxtrapolate.methods.method import Stage, Values, rendered
 from jaxtrapolate.motion import chain_motion
@@ -84,15 +84,11 @@ SKY = Stage("sky", _sky, reads=("target.sky", "target.sky_color"), optional=True
 
 
 def find_holes(target: GBuffer | None, source: GBuffer | None, motion: Array) -> Array:
-    """The union `[H, W, 1]` of all hole masks that the buffers allow, of the pixel nearest to the landing place.
+    """The union `[H, W, 1]` of all hole masks that the buffers allow, by the pixel nearest to the landing place.
 
     Judged by all four bilinear taps, every pixel beside a silhouette would be a hole as well.
     """
-    x, y, finite = landing(motion)
-    column, row = pixel_grid(*motion.shape[:2], dtype=x.dtype)
-    nearest = jnp.stack([jnp.floor(x + 0.5) - column, jnp.floor(y + 0.5) - row], -1)
-    nearest = jnp.where(finite[..., None], nearest, jnp.nan)
-    return hole_masks(target or GBuffer(), source or GBuffer(), nearest).any
+    return hole_masks(target or GBuffer(), source or GBuffer(), motion, taps="nearest").any
 
 
 def _holes(state, values: Values):
