@@ -158,7 +158,7 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
             excess = jnp.where(jnp.isfinite(farthest), distance / limit - 1, 1e6)
             position = jnp.where(concerned, _soft(excess, softness), 0)
         else:
-            position = concerned & ~(farthest <= jnp.square(limit))
+            position = concerned & ~((farthest <= jnp.square(limit)) & (farthest < jnp.inf))
 
     out = outside.astype(motion.dtype) if soft else outside
     return HoleMasks(stencil=stencil, normal=normal, position=position, outside=out)

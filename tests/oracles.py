@@ -230,7 +230,7 @@ def guided_offsets(strides):
     return out
 
 
-def guided_warp(image, motion, target, source, strides=(1, 3, 5, 9), sigma_guide=0.05, sigma_space=0.5, keep=4):
+def guided_warp(image, motion, target, source, strides=(1, 3, 5, 9), sigma_guide=0.03, sigma_space=0.5, keep=4):
     """The result, and by how much the last kept cost differs from the first that is not, relative to it."""
     image, target, source = (np.asarray(a, np.float64) for a in (image, target, source))
     height, width, _ = image.shape

@@ -195,6 +195,20 @@ def test_bad_positions_are_holes():
     assert {tuple(at[:2]) for at in np.argwhere(np.asarray(masks.position))} == {(2, 3), (4, 4)}
 
 
+def test_nearest_is_weighted_at_the_rounded_landing_place():
+    target, source = buffers(1), buffers(2)
+    motion = np.random.default_rng(3).uniform(-3, 3, (*SIZE, 2)).astype(np.float32)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    rounded = np.stack([np.floor(x + motion[..., 0] + 0.5) - x, np.floor(y + motion[..., 1] + 0.5) - y], -1)
+    near = hole_masks(gbuffer(target), gbuffer(source), jnp.asarray(motion), taps="nearest")
+    exact = hole_masks(gbuffer(target), gbuffer(source), jnp.asarray(rounded, jnp.float32))
+    inside = ~np.asarray(near.outside) & ~np.asarray(exact.outside)
+    for name in ("stencil", "normal", "position"):
+        np.testing.assert_array_equal(
+            np.asarray(getattr(near, name))[inside], np.asarray(getattr(exact, name))[inside], err_msg=name
+        )
+
+
 NAMES = ("stencil", "normal", "position", "outside")
 
 
@@ -291,7 +305,7 @@ def test_union_of_nothing(unchecked):
 @pytest.mark.parametrize(
     "change, error, message",
     [
-        ({"taps": "all"}, ValueError, "taps: expected one of 'weighted', 'release', got 'all'"),
+        ({"taps": "all"}, ValueError, "taps: expected one of 'weighted', 'nearest', 'release', got 'all'"),
         ({"motion": jnp.zeros((6, 8, 3))}, ValueError, r"motion: expected shape \[H, W, 2\], got \[6, 8, 3\]"),
         ({"motion": jnp.zeros((6, 8, 2), int)}, TypeError, "motion: expected a floating-point array"),
         ({"target": jx.GBuffer(stencil=jnp.zeros((6, 7, 1)))}, ValueError, r"target\.stencil: .*\[6, 8, 1\], got"),
