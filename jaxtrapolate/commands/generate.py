@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     console = Console(stderr=True)
     if options.factor < 2:
         raise InputError(f"--factor: expected 2 or more, got {options.factor}")
-    (method,) = _one(open_methods(options.method))
+    (method,) = _one(open_methods(options.method, option="--method"))
     sequence = open_input(options.input, motion=options.motion, strict=options.strict)
     folder = output_folder(options.output)
     missing = [n for n in sequence.numbers if not sequence.has_color(n)]

@@ -38,15 +38,15 @@ def open_input(text: str, *, motion: str | None = None, strict: bool = False) ->
     return SceneSequence(name)
 
 
-def open_methods(names: str) -> dict[str, Method]:
-    """The methods of a comma-separated list."""
+def open_methods(names: str, *, option: str = "--methods") -> dict[str, Method]:
+    """The methods of a comma-separated list; `option` is where it was given."""
     methods = {}
     for name in filter(None, (n.strip() for n in names.split(","))):
         if name not in method_names():
-            raise InputError(f"--methods: no method {name!r}; there are {', '.join(method_names())}")
+            raise InputError(f"{option}: no method {name!r}; there are {', '.join(method_names())}")
         methods[name] = load(name)
     if not methods:
-        raise InputError(f"--methods: expected names separated by commas, of {', '.join(method_names())}")
+        raise InputError(f"{option}: expected names separated by commas, of {', '.join(method_names())}")
     return methods
 
 

@@ -49,11 +49,13 @@ def _blade_width(x: Array, size: Vector) -> Array:
 
 
 def enter_plane(o: Vector, d: Vector, size: Vector) -> Array:
+    """t at which a ray enters the half space z < 0 from above; infinite where it does not."""
     t = -o.z / _safe(d.z)
     return jnp.where((d.z < 0) & (t > 0), t, jnp.inf)
 
 
 def enter_box(o: Vector, d: Vector, size: Vector) -> Array:
+    """t at which a ray enters the box of half edges `size`; infinite where it misses or starts inside."""
     near, far = _slabs(o, d, size)
     return jnp.where((near < far) & (near > 0), near, jnp.inf)
 
@@ -68,12 +70,14 @@ def _enter_ball(o: Vector, d: Vector, radius2: Array | float) -> tuple[Array, Ar
 
 
 def enter_sphere(o: Vector, d: Vector, size: Vector) -> Array:
+    """t at which a ray enters the ellipsoid of half axes `size`; infinite where it misses."""
     inverse = Vector(1 / size.x, 1 / size.y, 1 / size.z)
     t, hit = _enter_ball(o * inverse, d * inverse, 1.0)
     return jnp.where(hit & (t > 0), t, jnp.inf)
 
 
 def enter_capsule(o: Vector, d: Vector, size: Vector) -> Array:
+    """t at which a ray enters the capsule along z, radius size.x, half length size.z; infinite where it misses."""
     radius2 = size.x * size.x
     square = jnp.maximum(d.x * d.x + d.y * d.y, 1e-18)
     across = d.x * o.y - d.y * o.x
@@ -87,6 +91,7 @@ def enter_capsule(o: Vector, d: Vector, size: Vector) -> Array:
 
 
 def enter_blade(o: Vector, d: Vector, size: Vector) -> Array:
+    """t at which a ray crosses the flat blade in z = 0 that narrows along x; infinite where it misses."""
     t = -o.z / _safe(d.z)
     x, y = o.x + t * d.x, o.y + t * d.y
     hit = (jnp.abs(x) <= size.x) & (jnp.abs(y) <= _blade_width(x, size)) & (t > 0)
@@ -94,48 +99,57 @@ def enter_blade(o: Vector, d: Vector, size: Vector) -> Array:
 
 
 def distance_plane(p: Vector, size: Vector) -> Array:
+    """Signed distance of a point to the plane."""
     return p.z
 
 
 def distance_box(p: Vector, size: Vector) -> Array:
+    """Signed distance of a point to the box."""
     q = p.map(jnp.abs) - size
     return q.map(lambda value: jnp.maximum(value, 0)).length() + jnp.minimum(q.largest(), 0)
 
 
 def distance_sphere(p: Vector, size: Vector) -> Array:
+    """Signed distance of a point to the ellipsoid; exact for a sphere, else to first order."""
     scaled = jnp.maximum((p / size).length(), 1e-6)
     return p.length() * (1 - 1 / scaled)
 
 
 def distance_capsule(p: Vector, size: Vector) -> Array:
+    """Signed distance of a point to the capsule."""
     z = p.z - jnp.clip(p.z, -size.z, size.z)
     return jnp.sqrt(p.x * p.x + p.y * p.y + z * z) - size.x
 
 
 def distance_blade(p: Vector, size: Vector) -> Array:
+    """Distance of a point to the blade, which has no inside."""
     x = jnp.maximum(jnp.abs(p.x) - size.x, 0)
     y = jnp.maximum(jnp.abs(p.y) - _blade_width(p.x, size), 0)
     return jnp.sqrt(x * x + y * y + p.z * p.z)
 
 
 def gap_plane(o: Vector, d: Vector, size: Vector) -> Gap:
+    """Where a ray meets the plane, and -1 or 1: from above it always hits, from below never."""
     t = -o.z / _safe(d.z)
     return t, jnp.where(d.z < 0, -1.0, 1.0) * jnp.ones_like(t)
 
 
 def gap_box(o: Vector, d: Vector, size: Vector) -> Gap:
+    """t of the middle of the ray within the slabs, and the signed distance there: how nearly it misses the box."""
     near, far = _slabs(o, d, size)
     t = 0.5 * (near + far)
     return t, distance_box(o + d * t, size)
 
 
 def gap_sphere(o: Vector, d: Vector, size: Vector) -> Gap:
+    """t of the closest approach to the ellipsoid, and the signed distance there."""
     inverse = Vector(1 / size.x, 1 / size.y, 1 / size.z)
     t, q = _closest_approach(o * inverse, d * inverse)
     return t, distance_sphere(q * size, size)
 
 
 def gap_capsule(o: Vector, d: Vector, size: Vector) -> Gap:
+    """t of the closest approach to the capsule, and the signed distance there."""
     t = -(o.x * d.x + o.y * d.y) / jnp.maximum(d.x * d.x + d.y * d.y, 1e-18)
     z = jnp.clip(o.z + t * d.z, -size.z, size.z)
     t, q = _closest_approach(Vector(o.x, o.y, o.z - z), d)
@@ -143,6 +157,7 @@ def gap_capsule(o: Vector, d: Vector, size: Vector) -> Gap:
 
 
 def gap_blade(o: Vector, d: Vector, size: Vector) -> Gap:
+    """t at which a ray crosses the plane of the blade, and how far outside, as the ray sees it."""
     t = -o.z / _safe(d.z)
     x, y = o.x + t * d.x, o.y + t * d.y
     gap = jnp.maximum(jnp.abs(x) - size.x, jnp.abs(y) - _blade_width(x, size))
