@@ -76,7 +76,7 @@ def enter_field(field: HeightField, o: Vector, d: Vector) -> Array:
     end = jnp.where(d.z < -1e-9, (bottom - o.z) / down, jnp.inf)
     speed = jnp.abs(d.z) + field.slope() * jnp.sqrt(d.x * d.x + d.y * d.y)
 
-    def advance(_: int, t: Array) -> Array:
+    def advance(_: Array, t: Array) -> Array:
         gap = o.z + t * d.z - field.height(o.x + t * d.x, o.y + t * d.y)
         return jnp.minimum(t + gap / speed, end)
 
