@@ -76,11 +76,11 @@ def enter_field(field: HeightField, o: Vector, d: Vector) -> Array:
     end = jnp.where(d.z < -1e-9, (bottom - o.z) / down, jnp.inf)
     speed = jnp.abs(d.z) + field.slope() * jnp.sqrt(d.x * d.x + d.y * d.y)
 
-    def advance(_: Array, t: Array) -> Array:
+    def advance(_: Array | int, t: Array) -> Array:
         gap = o.z + t * d.z - field.height(o.x + t * d.x, o.y + t * d.y)
         return jnp.minimum(t + gap / speed, end)
 
-    def polish(_: int, t: Array) -> Array:
+    def polish(_: Array | int, t: Array) -> Array:
         x, y = o.x + t * d.x, o.y + t * d.y
         along_x, along_y = field.gradient(x, y)
         closing = along_x * d.x + along_y * d.y - d.z
@@ -105,7 +105,7 @@ def field_gap(field: HeightField, o: Vector, d: Vector, softness: Array) -> Arra
     rise = jnp.where(d.z > 1e-3, d.z, 1e-3)
     span = jnp.clip((top - o.z) / rise, 0.0, 60.0 / d.length())
 
-    def look(step: int, smallest: Array) -> Array:
+    def look(step: Array | int, smallest: Array) -> Array:
         t = span * ((step + 1.0) / SHADOW_STEPS) ** 2
         gap = o.z + t * d.z - field.height(o.x + t * d.x, o.y + t * d.y)
         return jnp.minimum(smallest, gap / jnp.maximum(t * softness, 1e-6))
