@@ -7,8 +7,8 @@ import pytest
 
 from jaxtrapolate.records import check_frame
 from jaxtrapolate.scenes import flow, keyframe, render, visible
-from jaxtrapolate.scenes.library import common
 from jaxtrapolate.scenes.scene import Builder, Scene, frame_along, material, path, turn, yaw
+from jaxtrapolate.scenes.worlds import common
 
 SIZE = (46, 74)
 TIME, BEFORE = 7.0, 5.0

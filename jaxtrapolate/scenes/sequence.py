@@ -5,8 +5,8 @@ import numpy as np
 
 from jaxtrapolate.files.sequence import MotionConvention, Sequence
 from jaxtrapolate.records import Frame, Keyframe, R
-from jaxtrapolate.scenes.library import scene
 from jaxtrapolate.scenes.render import keyframe, render, visible
+from jaxtrapolate.scenes.worlds import scene
 
 
 class SceneSequence(Sequence):

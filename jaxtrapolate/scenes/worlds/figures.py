@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from jaxtrapolate.scenes.library import common
 from jaxtrapolate.scenes.scene import Builder, Scene, material, path, turn, yaw
+from jaxtrapolate.scenes.worlds import common
 
 
 def walkers(rng: np.random.Generator) -> Scene:

@@ -3,8 +3,8 @@
 import numpy as np
 
 from jaxtrapolate.scenes.field import HeightField
-from jaxtrapolate.scenes.library import common
 from jaxtrapolate.scenes.scene import Builder, Scene, material, path, turn, yaw
+from jaxtrapolate.scenes.worlds import common
 
 WAVES = 7
 

@@ -7,12 +7,12 @@ import jax
 import numpy as np
 
 from jaxtrapolate.checks import check_choice
-from jaxtrapolate.scenes.library.demo import demo
-from jaxtrapolate.scenes.library.figures import head, walkers
-from jaxtrapolate.scenes.library.landscape import dock, forest, terrain, windmill
-from jaxtrapolate.scenes.library.night import interior, street
-from jaxtrapolate.scenes.library.still import still
 from jaxtrapolate.scenes.scene import Scene
+from jaxtrapolate.scenes.worlds.demo import demo
+from jaxtrapolate.scenes.worlds.figures import head, walkers
+from jaxtrapolate.scenes.worlds.landscape import dock, forest, terrain, windmill
+from jaxtrapolate.scenes.worlds.night import interior, street
+from jaxtrapolate.scenes.worlds.still import still
 
 SCENES: dict[str, Callable[[np.random.Generator], Scene]] = {
     "demo": demo,
