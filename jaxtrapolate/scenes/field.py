@@ -1,12 +1,12 @@
 """Height fields: an endless terrain z = h(x, y) that is a sum of waves, in world space.
 
 The waves are periodic parabolas, a sine's shape for a tenth of its price: S(v) = 8 v (1 - 2 |v|) on |v| <= 1/2, once
-continuously differentiable. Rays advance by steps that the largest slope allows (sphere tracing, Hart 1996), so that
-none passes through a crest, and end with Newton's iteration.
+continuously differentiable. Rays advance by steps that the largest curvature allows (after sphere tracing, Hart 1996),
+so that none passes through a crest.
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +15,8 @@ from jaxtyping import Array, Float
 from jaxtrapolate.records import record
 from jaxtrapolate.scenes.vector import Vector
 
-STEPS = 44
+STEPS = 28
 SHADOW_STEPS = 12
-NEWTON_STEPS = 3
 _BRAKE = 0.35  # how much of the sum of all slopes is taken for the largest slope: all waves never peak together
 
 
@@ -39,7 +38,7 @@ class HeightField:
         return jnp.sum(jnp.abs(self.amplitude))
 
     def slope(self) -> Array:
-        """The slope that steps are cut by."""
+        """The slope that distances are cut by."""
         return _BRAKE * 8 * jnp.sum(jnp.abs(self.amplitude) * jnp.linalg.norm(self.direction, axis=-1))
 
     def height(self, x: Any, y: Any) -> Any:
@@ -69,29 +68,40 @@ class HeightField:
 
 
 def enter_field(field: HeightField, o: Vector, d: Vector) -> Array:
-    """t > 0 where the ray origin + t direction meets the terrain from above, infinite where it does not."""
+    """t > 0 where the ray origin + t direction meets the terrain from above, infinite where it does not.
+
+    The height over the terrain, g(t), bends down by no more than K = sum of 32 |amplitude| (direction . d)^2, so that
+    g(t) + g'(t) s - K s^2 / 2 is below it, and its root a step that crosses nothing. Towards a crossing these are
+    Newton's steps; past a ridge that a ray grazes they grow with the root of the height, not in proportion to it. A
+    ray that is not there after `STEPS` of them misses: towards the horizon, and one in 50,000 that looks down.
+    """
     top, bottom = field.base + field.reach(), field.base - field.reach()
     down = jnp.where(d.z < -1e-9, d.z, -1e-9)
-    start = jnp.maximum((top - o.z) / down, 0.0)
+    start = jnp.where(d.z < -1e-9, jnp.maximum((top - o.z) / down, 0.0), 0.0)
     end = jnp.where(d.z < -1e-9, (bottom - o.z) / down, jnp.inf)
-    speed = jnp.abs(d.z) + field.slope() * jnp.sqrt(d.x * d.x + d.y * d.y)
+    along = [field.direction[k, 0] * d.x + field.direction[k, 1] * d.y for k in range(field.amplitude.shape[-1])]
+    bend = cast(Array, sum(32 * jnp.abs(field.amplitude[k]) * v * v for k, v in enumerate(along)))
+    bend = jnp.maximum(bend, 1e-9)
+
+    def gap(t: Array) -> tuple[Array, Array]:
+        """g and its derivative."""
+        x, y = o.x + t * d.x, o.y + t * d.y
+        height, slope = field.base + jnp.zeros_like(t), jnp.zeros_like(t)
+        for k, rate in enumerate(along):
+            v = field.direction[k, 0] * x + field.direction[k, 1] * y + field.phase[k]
+            v = v - jnp.floor(v + 0.5)
+            height += field.amplitude[k] * 8 * v * (1 - 2 * jnp.abs(v))
+            slope += field.amplitude[k] * 8 * (1 - 4 * jnp.abs(v)) * rate
+        return o.z + t * d.z - height, d.z - slope
 
     def advance(_: Array | int, t: Array) -> Array:
-        gap = o.z + t * d.z - field.height(o.x + t * d.x, o.y + t * d.y)
-        return jnp.minimum(t + gap / speed, end)
+        g, rate = gap(t)
+        root = jnp.sqrt(jnp.maximum(rate * rate + 2 * bend * g, 0.0))
+        step = jnp.where(rate > 0, (rate + root) / bend, 2 * g / jnp.maximum(root - rate, 1e-9))
+        return jnp.minimum(t + step, end)
 
-    def polish(_: Array | int, t: Array) -> Array:
-        x, y = o.x + t * d.x, o.y + t * d.y
-        along_x, along_y = field.gradient(x, y)
-        closing = along_x * d.x + along_y * d.y - d.z
-        gap = o.z + t * d.z - field.height(x, y)
-        return t + jnp.where(closing > 0.05 * speed, gap / jnp.where(closing > 0.05 * speed, closing, 1.0), 0.0)
-
-    start = jnp.where(d.z < -1e-9, start, 0.0) + jnp.zeros_like(o.x + d.x)
-    t = jax.lax.fori_loop(0, STEPS, advance, start)
-    t = jax.lax.fori_loop(0, NEWTON_STEPS, polish, t)
-    gap = o.z + t * d.z - field.height(o.x + t * d.x, o.y + t * d.y)
-    hit = (jnp.abs(gap) < 2e-3 * (1 + t * d.length())) & (t > 0) & (d.z < -1e-9)
+    t = jax.lax.fori_loop(0, STEPS, advance, start + jnp.zeros_like(o.x + d.x))
+    hit = (jnp.abs(gap(t)[0]) < 5e-3 * (1 + t * d.length())) & (t > 0) & (d.z < -1e-9)
     return jnp.where(hit, t, jnp.inf)
 
 

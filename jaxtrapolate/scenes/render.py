@@ -4,7 +4,9 @@ Everything is a pure function of the scene's parameters and of time: jit, vmap a
 """
 
 import functools
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +37,9 @@ Time = int | float | Float[Array, ""]
 
 OPENNESS_HEIGHTS = (0.12, 0.45)
 """Metres above a surface at which the ambient light's occlusion is measured."""
+
+_PACKS = 8
+"""Into how many packs the pixels of a frame are divided when reflections are traced, each with its own bounce."""
 
 
 def render(
@@ -181,7 +186,7 @@ def _color(
 
     free = openness(placed, s.position, s.normal, s.primitive, OPENNESS_HEIGHTS)
     mirrored = stage(_mirror)(ray, n, s.normal)
-    traced = _bounce(scene, placed, time, s, mirrored, view, shadowed) if scene.bounce else None
+    traced = _traced(scene, placed, time, s, mirrored, view, shadowed) if scene.bounce else None
     parts = (scene.sky, scene.lights, s, hit.t, d, n, mirrored, free, direct, shading.reflectance(s), traced)
     color = stage(_combine)(*parts)
     return color, s, jnp.where(s.hit, shadow, 0.0)
@@ -220,12 +225,53 @@ def _combine(
     return select(s.hit, color, shading.sky_radiance(sky, lights, d, s.cloud, sun=True))
 
 
-def _bounce(
+def _traced(
     scene: Scene, placed: Placed, time: Array, s: shading.Surface, ray: Vector, view: View, shadowed: bool
 ) -> Vector:
+    """`_bounce` where the surface is smooth enough for it to count, 0 elsewhere: packs of such pixels, one by one.
+
+    What a pack reads and makes is gathered and scattered; a frame without a mirror costs nothing.
+    """
+    shape = s.width.shape
+    total = math.prod(shape)
+    pack = -(-total // _PACKS)
+    needed = (s.hit & (s.roughness < shading.ROUGH)).reshape(-1)
+    place = jnp.cumsum(needed, dtype=jnp.int32)
+    count = place[-1]
+    # order[k] is the k-th pixel that needs a bounce; what needs none goes to a slot that nobody reads
+    pixels = jnp.arange(total, dtype=jnp.int32)
+    order = jnp.zeros(_PACKS * pack + 1, jnp.int32).at[jnp.where(needed, place - 1, _PACKS * pack)].set(pixels)
+    given = (s.position, s.primitive, s.roughness, s.width, ray)
+    table = jax.tree.map(lambda leaf: leaf.reshape(-1), given)
+
+    def one(number: Array, colors: Vector) -> Vector:
+        first = number * pack
+        taken = jax.lax.dynamic_slice(order, (first,), (pack,))
+        rows = jax.tree.map(lambda leaf: leaf.at[taken].get(mode="promise_in_bounds"), table)
+        position, primitive, roughness, width, mirrored = rows
+        found = _bounce(scene, placed, time, position, primitive, roughness, width, mirrored, view, shadowed)
+        at = jnp.where(first + jnp.arange(pack, dtype=jnp.int32) < count, taken, total)
+        return jax.tree.map(lambda leaf, value: leaf.at[at].set(value, mode="drop"), colors, found)
+
+    zero = vector(jnp.zeros(total))
+    return jax.lax.fori_loop(0, -(-count // pack), one, zero).map(lambda leaf: leaf.reshape(shape))
+
+
+def _bounce(
+    scene: Scene,
+    placed: Placed,
+    time: Array,
+    position: Vector,
+    primitive: Array,
+    roughness: Array,
+    width: Array,
+    ray: Vector,
+    view: View,
+    shadowed: bool,
+) -> Vector:
     """What a mirrored ray sees: lit surfaces and the sky, their textures blurred by the roughness of the mirror."""
-    hit = stage(first_hit)(placed, s.position, ray, s.primitive)
-    growth = 1.0 / view.scale[0] + 0.7 * s.roughness**2
+    hit = stage(first_hit)(placed, position, ray, primitive)
+    growth = 1.0 / view.scale[0] + 0.7 * roughness**2
     helper = select(jnp.abs(ray.x) < 0.7, Vector(1.0, 0.0, 0.0), Vector(0.0, 1.0, 0.0))
     zero = jnp.zeros_like(ray.x)
     helper = Vector(helper.x + zero, helper.y + zero, helper.z + zero)
@@ -234,10 +280,10 @@ def _bounce(
 
     def spread(t: Array, n: Vector) -> list[Vector]:
         slant = jnp.minimum(n.dot(ray), -0.05)
-        width = s.width + t * growth
-        return [(edge - ray * (n.dot(edge) / slant)) * width for edge in (first, second)]
+        grown = width + t * growth
+        return [(edge - ray * (n.dot(edge) / slant)) * grown for edge in (first, second)]
 
-    s2 = shading.surface(scene, placed, time, s.position, ray, hit, spread)
+    s2 = shading.surface(scene, placed, time, position, ray, hit, spread)
     direct, _ = shading.direct_light(scene, placed, time, s2, s2.normal, -ray, shadows_of_dynamic=shadowed)
 
     @stage
@@ -282,29 +328,33 @@ def _render(
 
         total, _ = jax.lax.scan(add, vector(jnp.zeros(size)), jnp.asarray(_offsets(samples)))
         color = total * (1.0 / samples)
-    depth = jnp.where(s.hit, hit.t, FAR)
-    point = select(s.hit, s.position, origin(view) + d * FAR)
-    _, there, here = _reprojected(
-        scene, (view, view_before), (placed.poses, placed_before.poses), s.hit, s.body, point, d
-    )
-    stencil = jnp.where(s.hit, scene.bodies.stencil.at[s.body].get(mode="promise_in_bounds"), 0.0)
-    zero = vector(0.0)
-    gbuffer = GBuffer(
-        albedo=s.albedo.stack(),
-        depth=depth[..., None],
-        normal=s.normal.stack(),
-        position=point.stack(),
-        roughness=s.roughness[..., None],
-        metallic=s.metallic[..., None],
-        specular=s.specular[..., None],
-        n_dot_v=jnp.clip(-d.normalized().dot(s.normal), 0.0, 1.0)[..., None],
-        stencil=stencil[..., None],
-        shadow=(shadow if shadowed else jnp.zeros_like(shadow))[..., None],
-        sky=(1.0 - s.hit.astype(jnp.float32))[..., None],
-        sky_color=select(s.hit, zero, color).stack(),
-    )
-    motion = jnp.stack([there.x - here.x, there.y - here.y], axis=-1)
-    return Frame(color.stack(), gbuffer, motion, matrices(view, size), jitter, time)
+    poses = (placed.poses, placed_before.poses)
+
+    # Planes first, then channels: interleaving while computing would be done point by point, not in vectors.
+    @stage
+    def planes(s: shading.Surface, t: Array, d: Vector, color: Vector, shadow: Array) -> dict[str, Any]:
+        point = select(s.hit, s.position, origin(view) + d * FAR)
+        _, there, here = _reprojected(scene, (view, view_before), poses, s.hit, s.body, point, d)
+        return {
+            "albedo": s.albedo,
+            "depth": jnp.where(s.hit, t, FAR),
+            "normal": s.normal,
+            "position": point,
+            "roughness": s.roughness,
+            "metallic": s.metallic,
+            "specular": s.specular,
+            "n_dot_v": jnp.clip(-d.normalized().dot(s.normal), 0.0, 1.0),
+            "stencil": jnp.where(s.hit, scene.bodies.stencil.at[s.body].get(mode="promise_in_bounds"), 0.0),
+            "shadow": shadow if shadowed else jnp.zeros_like(shadow),
+            "sky": 1.0 - s.hit.astype(jnp.float32),
+            "sky_color": select(s.hit, vector(0.0), color),
+            "motion": (there.x - here.x, there.y - here.y),
+        }
+
+    made = planes(s, hit.t, d, color, shadow)
+    motion = jnp.stack(made.pop("motion"), axis=-1)
+    gbuffer = {name: v.stack() if isinstance(v, Vector) else v[..., None] for name, v in made.items()}
+    return Frame(color.stack(), GBuffer(**gbuffer), motion, matrices(view, size), jitter, time)
 
 
 @functools.partial(jax.jit, static_argnames=("size",))

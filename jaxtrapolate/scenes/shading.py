@@ -253,9 +253,8 @@ def direct_light(
         total = total + reflected * Vector(color[0], color[1], color[2]) * amount
 
     if scene.sun:
-        one, sun = jnp.ones_like(s.width), lights.sun_direction
-        to = Vector(sun[0] * one, sun[1] * one, sun[2] * one)
-        add(to, lights.sun_color, one, near=False, softness=lights.sun_radius)
+        sun = Vector(*(lights.sun_direction[k] for k in range(3)))  # scalars: turned once for each primitive
+        add(sun, lights.sun_color, jnp.ones(()), near=False, softness=lights.sun_radius)
     if lights.lamp_radius.shape[0]:
         where, levels = lights.lamp_path.at(time), lamp_levels(lights, time)
         for k in range(where.shape[0]):

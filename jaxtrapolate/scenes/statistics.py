@@ -75,3 +75,8 @@ def table(rows: dict[str, Statistics]) -> str:
         values = [f"{row.motion:.1f}"] + [f"{100 * getattr(row, name):.1f}" for name in names[1:]]
         lines.append(f"| {scene_name} | " + " | ".join(values) + " |")
     return "\n".join(lines)
+
+
+def mean(rows: Iterable[Statistics]) -> Statistics:
+    """The means of several."""
+    return Statistics(*(float(value) for value in np.mean([dataclasses.astuple(row) for row in rows], axis=0)))

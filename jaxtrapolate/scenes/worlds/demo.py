@@ -7,7 +7,7 @@ from jaxtrapolate.scenes.worlds import common
 
 
 def demo(rng: np.random.Generator) -> Scene:
-    """The scene that the command `demo` runs on."""
+    """A courtyard: a little cart and a ball move among blocks and polished stones (the command `demo` shows it)."""
     b = Builder()
     stone = common.shifted(rng, (0.36, 0.32, 0.27))
     ground = material(

@@ -48,7 +48,7 @@ def walkers(rng: np.random.Generator) -> Scene:
             degrees=rng.uniform(46, 54),
         ),
         sky=common.daylight(rng),
-        sun_direction=common.sun_from(rng.uniform(0, 360), rng.uniform(30, 45)),
+        sun_direction=common.sun_from(rng.uniform(0, 360), rng.uniform(20, 30)),
         sun_color=np.array([1.0, 0.88, 0.7]) * rng.uniform(1.3, 1.7),
         sun_radius=0.015,
         bounce=False,

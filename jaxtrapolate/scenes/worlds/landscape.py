@@ -38,16 +38,16 @@ def terrain(rng: np.random.Generator) -> Scene:
         roughness=0.9,
     )
     b.field(hills, soil)
-    for x, y in common.spots(rng, 14, (-38, -38), (38, 38), 8):
+    for x, y in common.spots(rng, 24, (-24, -24), (24, 24), 5):
         ground = float(hills.height(np.float32(x), np.float32(y)))
-        r = rng.uniform(1.2, 2.4)
-        common.crown(b, rng, (x, y, ground + r), (r, r, 1.5 * r), (0.1, 0.2, 0.06))
+        r = rng.uniform(1.0, 1.9)
+        common.crown(b, rng, (x, y, ground + 1.4 * r), (r, r, 2.6 * r), (0.1, 0.2, 0.06))
     for k in range(3):
         r = rng.uniform(2.2, 3.2)
         way = rng.choice([-1, 1])
-        centre = (*rng.uniform(-8, 8, 2), rng.uniform(13, 16))
+        centre = (*rng.uniform(-6, 6, 2), rng.uniform(11, 13))
         drift = common.circle(
-            rng.uniform(10, 24), way * rng.uniform(260, 420), rng.uniform(), centre=centre, sway=1.5, bob=1.0
+            rng.uniform(6, 14), way * rng.uniform(200, 300), rng.uniform(), centre=centre, sway=1.5, bob=1.0
         )
         body = b.body(drift, turn(rate=0.02 * way), stencil=k + 1)
         silk = common.hue(rng)
@@ -59,10 +59,10 @@ def terrain(rng: np.random.Generator) -> Scene:
             b.limb((0.2 * r, x * r, -1.8 * r), (0.55 * r, 2.4 * x * r, -0.9 * r), 0.05, wicker, body=body)
             b.limb((-0.2 * r, x * r, -1.8 * r), (-0.55 * r, 2.4 * x * r, -0.9 * r), 0.05, wicker, body=body)
     way = rng.choice([-1, 1])
-    radius, phase = rng.uniform(26, 32), rng.uniform()
+    radius, phase = rng.uniform(23, 27), rng.uniform()
     return b.build(
         camera=common.camera(
-            common.circle(radius, way * rng.uniform(330, 420), phase, centre=(0, 0, rng.uniform(29, 33)), bob=1.5),
+            common.circle(radius, way * rng.uniform(300, 360), phase, centre=(0, 0, rng.uniform(18, 22)), bob=1.5),
             common.circle(4.0, way * 200.0, rng.uniform(), centre=(0, 0, 0)),
             degrees=rng.uniform(44, 52),
         ),
@@ -140,7 +140,7 @@ def windmill(rng: np.random.Generator) -> Scene:
             degrees=rng.uniform(50, 56),
         ),
         sky=common.daylight(rng),
-        sun_direction=common.sun_from(rng.uniform(0, 360), rng.uniform(30, 42)),
+        sun_direction=common.sun_from(rng.uniform(0, 360), rng.uniform(22, 32)),
         sun_color=np.array([1.0, 0.88, 0.7]) * rng.uniform(1.4, 1.8),
         sun_radius=0.0,
         bounce=False,

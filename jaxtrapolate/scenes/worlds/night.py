@@ -170,7 +170,4 @@ def street(rng: np.random.Generator) -> Scene:
             degrees=rng.uniform(50, 58),
         ),
         sky=common.sky((0.006, 0.009, 0.02), (0.03, 0.03, 0.05), (0.012, 0.01, 0.01), glow=0.0, cover=0.0, ambient=1.0),
-        sun_direction=common.sun_from(rng.uniform(0, 360), 50),
-        sun_color=np.array([0.05, 0.07, 0.12]),
-        sun_radius=0.01,
     )
