@@ -7,9 +7,10 @@ import argparse
 import json
 from pathlib import Path
 
-import numpy as np
 from PIL import Image, ImageDraw
 
+from jaxtrapolate.checks import check_present
+from jaxtrapolate.commands.pictures import buffer_picture, eight_bit, motion_picture
 from jaxtrapolate.evaluation import display
 from jaxtrapolate.scenes import SceneSequence, scene_names
 
@@ -53,13 +54,16 @@ def demo_strip(folder: Path) -> Image.Image:
 
 
 def contact_sheet() -> Image.Image:
-    """One frame of every embedded scene."""
+    """Every embedded scene with its buffers, a row each."""
     tiles = []
     for name in scene_names():
-        frame = SceneSequence(name, frames=22, size=(180, 320), samples=4).frame(21)
-        image = (np.asarray(display(frame.color, hdr=True)) * 255).round().astype(np.uint8)
-        tiles.append(labelled(Image.fromarray(image), name))
-    return sheet(tiles, 4)
+        frame = SceneSequence(name, frames=22, size=(90, 160), samples=4).frame(21)
+        g = check_present("gbuffer", frame.gbuffer, needed_by="contact_sheet")
+        shown = {name: eight_bit(display(frame.color, hdr=True)), "motion": motion_picture(frame.motion)}
+        shown |= {n: buffer_picture(n, getattr(g, n), g.sky) for n in ("albedo", "normal", "depth", "roughness")}
+        shown |= {n: buffer_picture(n, getattr(g, n), g.sky) for n in ("stencil", "shadow")}
+        tiles += [labelled(Image.fromarray(picture), text) for text, picture in shown.items()]
+    return sheet(tiles, 8)
 
 
 def main() -> None:

@@ -5,7 +5,8 @@ chains over the held-back frames between by their buffers.
 """
 
 import dataclasses
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -17,10 +18,14 @@ from jaxtrapolate.causes import CAUSES, cause_map, disoccluded
 from jaxtrapolate.checks import ArrayLike, check_present
 from jaxtrapolate.files import Sequence, prefetch, runs
 from jaxtrapolate.methods.method import Method
-from jaxtrapolate.metrics import psnr, ssim
+from jaxtrapolate.metrics import Metric, psnr
+from jaxtrapolate.metrics import load as load_metric
 from jaxtrapolate.radiance import srgb_encode, tonemap
 from jaxtrapolate.records import Frame, replace
 from jaxtrapolate.timing import Timing, measure
+
+DEFAULT_METRICS = ("psnr", "ssim")
+"""What is scored where nothing else is named; "psnr" always is, for it is told apart by cause."""
 
 
 def hide(frame: Frame) -> Frame:
@@ -100,14 +105,33 @@ def causes_of(sequence: Sequence, window: Window) -> np.ndarray | None:
     return np.asarray(cause_map(window.truth, window.history[-1], motion, hidden=hidden, metric_depth=metric))
 
 
-def score(image: Array, window: Window, causes: np.ndarray | None, invalid: np.ndarray | None, *, hdr: bool) -> dict:
-    """PSNR and SSIM of a made frame, whole and by cause; pixels that were not finite in the input are left out."""
+def score(
+    image: Array,
+    window: Window,
+    causes: np.ndarray | None,
+    invalid: np.ndarray | None,
+    *,
+    hdr: bool,
+    metrics: Iterable[Metric] | None = None,
+) -> dict[str, Any]:
+    """PSNR of a made frame, whole and by cause, and its other metrics; psnr and ssim where none are named.
+
+    Pixels that were not finite in the input are left out. A metric that cannot be had (a frame smaller than its window)
+    is None, and "unscored" says why. Metrics of clips are not for here.
+    """
     color = check_present("truth.color", window.truth.color, needed_by="score")
-    made, truth = display(image, hdr=hdr), display(color, hdr=hdr)
+    spaces = {"display": (display(image, hdr=hdr), display(color, hdr=hdr)), "linear": (image, color)}
+    made, truth = spaces["display"]
     valid = np.ones((*made.shape[:2], 1), bool) if invalid is None else ~invalid[..., None]
-    result: dict[str, Any] = {"number": window.number, "psnr": float(psnr(made, truth, mask=valid)), "ssim": None}
-    if min(made.shape[:2]) >= 11:
-        result["ssim"] = float(ssim(made, truth, mask=valid))
+    result: dict[str, Any] = {"number": window.number, "psnr": float(psnr(made, truth, mask=valid))}
+    for metric in map(load_metric, DEFAULT_METRICS) if metrics is None else metrics:
+        if metric.name == "psnr" or metric.per == "clip":
+            continue
+        try:
+            result[metric.name] = metric(*spaces[metric.space], mask=None if invalid is None else valid)
+        except ValueError as error:
+            result[metric.name] = None
+            result.setdefault("unscored", {})[metric.name] = str(error)
     result["by_cause"] = {}
     if causes is None:
         return result
@@ -119,20 +143,65 @@ def score(image: Array, window: Window, causes: np.ndarray | None, invalid: np.n
     return result
 
 
-def mean_over_frames(frames: list[dict]) -> dict[str, Any]:
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return float(np.mean(known)) if known else None
+
+
+def mean_over_frames(frames: list[dict], *, metrics: Iterable[str] = DEFAULT_METRICS) -> dict[str, Any]:
     """Means of the scores of several frames; a cause's dB over the frames in which it occurs, its share over all."""
-
-    def mean(values):
-        values = [v for v in values if v is not None]
-        return float(np.mean(values)) if values else None
-
     by_cause = {}
     for cause in CAUSES:
         found = [f["by_cause"][cause] for f in frames if cause in f["by_cause"]]
         if found:
             share = sum(f["share"] for f in found) / len(frames)
-            by_cause[cause] = {"psnr": mean([f["psnr"] for f in found]), "share": share}
-    return {"psnr": mean([f["psnr"] for f in frames]), "ssim": mean([f["ssim"] for f in frames]), "by_cause": by_cause}
+            by_cause[cause] = {"psnr": _mean(f["psnr"] for f in found), "share": share}
+    names = dict.fromkeys(("psnr", *metrics))
+    return {n: _mean(f.get(n) for f in frames) for n in names} | {"by_cause": by_cause}
+
+
+def mean_over_inputs(
+    inputs: list[Mapping[str, Any]], *, metrics: Iterable[str] = DEFAULT_METRICS
+) -> dict[str, dict[str, Any]]:
+    """Means of what `mean_over_frames` gave for each method on several inputs, on equal footing.
+
+    Args:
+        inputs: for each input its methods' scores by name, with "ms" as {"median", "iqr", "compile"}.
+        metrics: names.
+
+    Returns:
+        For each method what it had for one input. Only inputs on which all methods ran and none was exact (still
+        frames: infinite dB) count; where there is none such, those on which all ran, or else all inputs. "inputs" is
+        how many. Where a score of some method is infinite or not there, the input has no part in the mean of that score
+        for all methods. A cause's dB is the mean over the inputs in which it occurs, its share over all that count.
+        Compilation is the sum over all inputs.
+    """
+    names = list(dict.fromkeys(name for methods in inputs for name in methods))
+    shared = [i for i in inputs if all(name in i for name in names)] or inputs
+    shared = [i for i in shared if not any(m["psnr"] == math.inf for m in i.values())] or shared
+
+    def means(pick: Callable[[Any], float | None]) -> dict[str, float | None]:
+        rows = [{n: pick(i[n]) for n in names if n in i} for i in shared]
+        rows = [r for r in rows if all(v is not None for v in r.values())]
+        rows = [r for r in rows if all(v is not None and math.isfinite(v) for v in r.values())] or rows
+        return {n: _mean(r[n] for r in rows if n in r) for n in names}
+
+    result: dict[str, dict[str, Any]] = {n: {"inputs": sum(n in i for i in shared), "by_cause": {}} for n in names}
+    for metric in dict.fromkeys(("psnr", *metrics)):
+        for name, value in means(lambda m, metric=metric: m.get(metric)).items():
+            result[name][metric] = value
+    for cause in CAUSES:
+        here = [i for i in shared if any(cause in m["by_cause"] for m in i.values())]
+        for name, value in means(lambda m, cause=cause: m["by_cause"].get(cause, {}).get("psnr")).items():
+            if here:
+                shares = [i[name]["by_cause"].get(cause, {}).get("share", 0.0) for i in shared if name in i]
+                result[name]["by_cause"][cause] = {"psnr": value, "share": _mean(shares)}
+    for name in names:
+        spent = [i[name]["ms"] for i in shared if name in i]
+        result[name]["ms"] = {key: _mean(s.get(key) for s in spent) for key in ("median", "iqr")}
+        compiled = [i[name]["ms"].get("compile") for i in inputs if name in i]
+        result[name]["ms"]["compile"] = sum(c for c in compiled if c is not None)
+    return result
 
 
 def time_stages(method: Method, window: Window, *, repeats: int = 5) -> dict[str, Timing]:
@@ -148,6 +217,7 @@ def time_stages(method: Method, window: Window, *, repeats: int = 5) -> dict[str
 
 
 __all__ = [
+    "DEFAULT_METRICS",
     "Window",
     "arguments",
     "causes_of",
@@ -155,6 +225,7 @@ __all__ = [
     "held_back",
     "hide",
     "mean_over_frames",
+    "mean_over_inputs",
     "score",
     "time_stages",
     "windows",

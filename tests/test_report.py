@@ -1,11 +1,14 @@
 """The report: from synthetic results, complete, sparse and hostile; in a browser where one is installed."""
 
+import base64
 import html.parser
+import io
 import json
 import math
 import re
 import shutil
 import subprocess
+import urllib.parse
 import xml.etree.ElementTree
 
 import matplotlib
@@ -17,6 +20,7 @@ from jaxtrapolate import report
 from jaxtrapolate.causes import CAUSES
 from jaxtrapolate.files import InputError, write_png
 from jaxtrapolate.report import values
+from jaxtrapolate.report.pictures import Pictures
 
 HOSTILE = (
     "<script>document.documentElement.dataset.hacked=1</script>",
@@ -86,7 +90,7 @@ class Page(html.parser.HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.open, self.tags, self.text, self.root, self.images = [], [], [], {}, []
+        self.open, self.tags, self.text, self.root, self.images, self.links = [], [], [], {}, [], []
         self.feed(text)
         self.close()
         assert self.open == []
@@ -102,7 +106,11 @@ class Page(html.parser.HTMLParser):
             self.images.append(attributes.get("src"))
         for name, value in attributes.items():
             assert not name.startswith("on"), f"inline handler {name}"
-            if name in ("src", "href", "srcset", "action", "poster", "data"):
+            if name == "href" and not value.startswith("#"):  # a file beside the page
+                assert not urllib.parse.urlsplit(value).scheme
+                assert not value.startswith("/")
+                self.links.append(value)
+            elif name in ("src", "href", "srcset", "action", "poster", "data"):
                 assert value.startswith(("data:image/", "#")), value[:80]
 
     def handle_endtag(self, tag):
@@ -155,9 +163,80 @@ def test_page_is_complete_and_self_contained(tmp_path):
         assert expected in page.visible
     assert "gpu" not in page.visible
     assert all(color in text for color in report.CAUSE_COLORS.values())
-    embedded = [uri for uri in page.images if uri and uri.startswith("data:image/png")]
+    embedded = [uri for uri in page.images if uri and uri.startswith("data:image/webp")]
     assert len(embedded) == len(set(embedded)) == 4 + 2 * 3 + 1  # each picture once
     assert sum(bool(uri) and uri.startswith("data:image/svg+xml") for uri in page.images) == 3
+
+
+def decoded(uri):
+    """The picture in a data URI."""
+    kind, data = re.fullmatch(r"data:image/(\w+);base64,(.*)", uri).groups()
+    return kind, np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")), len(data)
+
+
+def test_pictures_are_small_and_near_and_those_of_few_colours_exact(tmp_path):
+    y, x = np.mgrid[0:180, 0:320]
+    noise = np.random.default_rng(0).normal(0, 4, (180, 320, 3))
+    photograph = np.stack([128 + 90 * np.sin(0.05 * x + k) * np.cos(0.04 * y) for k in range(3)], -1) + noise
+    photograph = photograph.round().clip(0, 255).astype(np.uint8)
+    error = report.colorize_error(np.abs(noise / 255).astype(np.float32))
+    write_png(tmp_path / "photograph.png", photograph)
+    write_png(tmp_path / "error.png", error)
+    pictures = Pictures(tmp_path)
+    kind, seen, size = decoded(pictures.uri("photograph.png"))
+    assert kind == "webp"
+    assert size < (tmp_path / "photograph.png").stat().st_size / 3
+    assert 10 * np.log10(255**2 / np.mean((seen.astype(float) - photograph) ** 2)) > 32
+    kind, seen, size = decoded(pictures.uri("error.png"))
+    assert kind == "webp"
+    np.testing.assert_array_equal(seen, error)
+    assert size < (tmp_path / "error.png").stat().st_size * 0.8
+    assert pictures.missing == []
+
+
+def several(folder):
+    """Results over inputs, one of which could not be used."""
+    results = complete(folder)
+    results |= {"pictures": [], "frames": None, "input": "2 of 3 inputs", "failed": {"gone": "gone: does not exist"}}
+    results["metrics"] = {
+        "psnr": {"better": "higher", "unit": "dB"},
+        "flip": {"better": "lower", "unit": ""},
+        "vmaf": {"per": "clip", "better": "higher"},
+    }
+    for i, method in enumerate(results["methods"].values()):
+        method |= {"flip": 0.3 - 0.1 * i, "vmaf": 70.0 + i, "frames": []}
+    scores = {name: {"psnr": 20.0 + i} for i, name in enumerate(results["methods"])}
+    results["inputs"] = [
+        {"folder": "demo-0", "size": [36, 64], "frames": 4, "methods": scores},
+        {"folder": "a b", "size": [180, 320], "frames": 7, "methods": {**scores, "repeat": {"psnr": "inf"}}},
+    ]
+    return results
+
+
+def test_page_of_several_inputs(tmp_path):
+    text = report.write_report(several(tmp_path), tmp_path).read_text()
+    page = Page(text)
+    assert page.links == ["demo-0/report.html", "a%20b/report.html"]
+    for expected in ("demo-0 20.00 21.00 22.00 64 × 36, 4 frames", "a b ∞ 21.00 22.00", "mean 22.00 26.00 30.00"):
+        assert expected in page.visible
+    for expected in ("2 of 3 inputs", "11 frames", "gone: does not exist", "FLIP ↓", "VMAF", "0.1000"):
+        assert expected in page.visible
+    assert "SSIM" not in page.visible
+    assert '<td class="top">0.1000</td>' in text  # of FLIP less is better
+    assert '<td class="top">72.00</td>' in text
+
+
+def test_links_lead_only_to_files_beside_the_page(tmp_path):
+    results = several(tmp_path)
+    results["inputs"][0]["folder"] = "javascript:alert(1)"
+    results["inputs"][1]["folder"] = "//elsewhere.example"
+    results["video"] = "../some where.webp"
+    page = Page(report.render_report(results, tmp_path))
+    assert page.links == [
+        "javascript%3Aalert%281%29/report.html",
+        "elsewhere.example/report.html",
+        "../some%20where.webp",
+    ]
 
 
 def test_page_is_the_same_from_json_and_every_time(tmp_path):
@@ -387,6 +466,15 @@ def test_browser_does_not_run_hostile_names(tmp_path, browse):
     assert "data-hacked" not in root
     assert "data-error" not in root
     assert root["data-ready"] == "1"
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_browser_shows_several_inputs_without_overflow(tmp_path, browse, width):
+    path = report.write_report(several(tmp_path), tmp_path)
+    root = root_of(browse(path, "dump-dom", f"window-size={width},1200", fragment="#selftest"))
+    assert "data-error" not in root
+    assert root["data-ready"] == "0"
+    assert root["data-selftest-overflow"] == "0"
 
 
 @pytest.mark.parametrize("scheme, ground", [(1, (246, 247, 248)), (0, (16, 19, 22))])

@@ -5,9 +5,9 @@ from typing import Any
 
 from rich.console import Console
 
-from jaxtrapolate.commands.evaluate import evaluate, print_table
-from jaxtrapolate.commands.inputs import output_folder
-from jaxtrapolate.commands.render import parse_size
+from jaxtrapolate.commands.evaluate import evaluate
+from jaxtrapolate.commands.inputs import output_folder, parse_size, steps
+from jaxtrapolate.commands.tables import print_table
 from jaxtrapolate.methods import load, method_names
 
 
@@ -32,7 +32,8 @@ def run(options: argparse.Namespace) -> None:
     sequence = SceneSequence("demo", frames=options.frames, size=parse_size(options.size))
     methods = {name: load(name) for name in method_names()}
     console = Console(stderr=True)
-    results = evaluate(sequence, methods, folder, console=console)
+    with steps(console) as step:
+        results = evaluate(sequence, methods, folder, step=step)
     print_table(results, Console())
     console.print(
         f"open {folder / 'report.html'}; numbers in {folder / 'results.json'}", soft_wrap=True, highlight=False

@@ -1,7 +1,11 @@
 """What the commands have in common: inputs, methods, output folders, progress."""
 
 import argparse
+import contextlib
+import dataclasses
 import os
+import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rich.console import Console
@@ -10,13 +14,27 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from jaxtrapolate.files import InputError, Sequence, open_sequence
 from jaxtrapolate.files.atomic import os_input_error
 from jaxtrapolate.methods import Method, load, method_names
+from jaxtrapolate.metrics import Metric, metric_names
+from jaxtrapolate.metrics import load as load_metric
 
 SCENES = "scenes:"
 
+Step = Callable[[str, float, float], None]
+"""How long work tells where it is: what it does, how much is done, of how much."""
 
-def add_input(parser: argparse.ArgumentParser) -> None:
-    """The arguments that name an input."""
-    parser.add_argument("input", metavar="INPUT", help="a folder of frames, or scenes:NAME for an embedded scene")
+
+def add_input(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
+    """The arguments that name an input, or several."""
+    if several:
+        text = (
+            f"folders of frames, or embedded scenes: {SCENES}NAME[:SEED], {SCENES}all, {SCENES}test (every test seed)"
+        )
+        parser.add_argument("inputs", nargs="+", metavar="INPUT", help=text)
+        parser.add_argument("--size", metavar="WxH", help="of embedded scenes, width and height in pixels (320x180)")
+        parser.add_argument("--length", type=int, metavar="N", help="of embedded scenes, how many frames (60)")
+    else:
+        text = f"a folder of frames, or {SCENES}NAME[:SEED] for an embedded scene"
+        parser.add_argument("input", metavar="INPUT", help=text)
     parser.add_argument(
         "--motion",
         metavar="CONVENTION",
@@ -26,16 +44,112 @@ def add_input(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--strict", action="store_true", help="refuse non-finite pixels and gaps in the numbering")
 
 
+@dataclasses.dataclass(frozen=True)
+class Input:
+    """What an INPUT argument names.
+
+    Attributes:
+        text: the argument, for messages.
+        name: of its folder of results, different for each input.
+        open: its sequence; raises InputError where it cannot be used.
+    """
+
+    text: str
+    name: str
+    open: Callable[[], Sequence]
+
+
 def open_input(text: str, *, motion: str | None = None, strict: bool = False) -> Sequence:
     """The sequence that an INPUT argument names."""
-    if not text.startswith(SCENES):
-        return open_sequence(text, motion=motion, strict=strict)
-    from jaxtrapolate.scenes import SceneSequence, scene_names
+    inputs = named_inputs([text], motion=motion, strict=strict)
+    if len(inputs) > 1:
+        raise InputError(f"{text}: names {len(inputs)} inputs; this command takes one")
+    return inputs[0].open()
 
-    name = text.removeprefix(SCENES)
-    if name not in scene_names():
-        raise InputError(f"{text}: no such scene; the embedded ones are {', '.join(scene_names())}")
-    return SceneSequence(name)
+
+def named_inputs(
+    texts: list[str],
+    *,
+    motion: str | None = None,
+    strict: bool = False,
+    size: str | None = None,
+    length: int | None = None,
+) -> list[Input]:
+    """What INPUT arguments name, each input once; none is opened yet.
+
+    Raises:
+        InputError: size or length that cannot be, or for folders, which have their own.
+    """
+    scenes = {}
+    if size is not None:
+        scenes["size"] = parse_size(size)
+    if length is not None:
+        if length < 1:
+            raise InputError(f"--length: expected 1 or more, got {length}")
+        scenes["frames"] = length
+    if scenes and not any(t.startswith(SCENES) for t in texts):
+        raise InputError(f"--size, --length: are for embedded scenes ({SCENES}NAME); a folder has its own")
+    found: dict[object, Input] = {}
+    for text in texts:
+        if text.startswith(SCENES):
+            for name, seed in _scenes(text):
+                key = f"{name}-{seed}"
+                found.setdefault((SCENES, key), Input(f"{SCENES}{name}:{seed}", key, _scene(name, seed, scenes)))
+        else:
+            place = Path(text).resolve()
+            name = place.parent.name if place.suffix == ".toml" else place.name
+            found.setdefault(place, Input(text, name, _folder(text, motion, strict)))
+    return _named_apart(list(found.values()))
+
+
+def _scenes(text: str) -> list[tuple[str, str]]:
+    """Names and seeds that scenes:NAME, scenes:NAME:SEED, scenes:all or scenes:test means."""
+    from jaxtrapolate.scenes import TEST_SEEDS, scene_names
+
+    name, _, seed = text.removeprefix(SCENES).partition(":")
+    if name in ("all", "test") and not seed:
+        seeds = (0,) if name == "all" else TEST_SEEDS
+        return [(scene, str(seed)) for scene in scene_names() for seed in seeds]
+    return [(name, seed or "0")]
+
+
+def _scene(name: str, seed: str, options: dict) -> Callable[[], Sequence]:
+    def opened() -> Sequence:
+        from jaxtrapolate.scenes import SceneSequence, scene_names
+
+        if name not in scene_names():
+            raise InputError(f"{SCENES}{name}: no such scene; the embedded ones are {', '.join(scene_names())}")
+        if not re.fullmatch("[0-9]+", seed):
+            raise InputError(f"{SCENES}{name}:{seed}: expected a seed of digits, such as {SCENES}{name}:0")
+        return SceneSequence(name, int(seed), **options)
+
+    return opened
+
+
+def _folder(text: str, motion: str | None, strict: bool) -> Callable[[], Sequence]:
+    return lambda: open_sequence(text, motion=motion, strict=strict)
+
+
+def _named_apart(inputs: list[Input]) -> list[Input]:
+    """The inputs with names that are fit for folders and told apart by a number: clip, clip-2."""
+    taken: set[str] = set()
+    result = []
+    for entry in inputs:
+        plain = re.sub(r"[^\w.-]+", "_", entry.name).strip(".") or "input"
+        name = next(
+            n for i in range(1, len(inputs) + 2) if (n := plain if i == 1 else f"{plain}-{i}").lower() not in taken
+        )
+        taken.add(name.lower())
+        result.append(dataclasses.replace(entry, name=name))
+    return result
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """(H, W) from "WxH"."""
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not match or min(int(g) for g in match.groups()) < 1:
+        raise InputError(f"--size: expected WxH such as 320x180, got {text!r}")
+    return int(match[2]), int(match[1])
 
 
 def open_methods(names: str, *, option: str = "--methods") -> dict[str, Method]:
@@ -48,6 +162,21 @@ def open_methods(names: str, *, option: str = "--methods") -> dict[str, Method]:
     if not methods:
         raise InputError(f"{option}: expected names separated by commas, of {', '.join(method_names())}")
     return methods
+
+
+def open_metrics(names: str) -> dict[str, Metric]:
+    """The metrics of a comma-separated list."""
+    found = {}
+    for name in filter(None, (n.strip() for n in names.split(","))):
+        if name not in metric_names():
+            raise InputError(f"--metrics: no metric {name!r}; there are {', '.join(metric_names())}")
+        try:
+            found[name] = load_metric(name)
+        except ImportError as error:
+            raise InputError(f"--metrics: {error}") from error
+    if not found:
+        raise InputError(f"--metrics: expected names separated by commas, of {', '.join(metric_names())}")
+    return found
 
 
 def output_folder(text: str) -> Path:
@@ -73,3 +202,11 @@ def progress(console: Console) -> Progress:
         transient=True,
         disable=not console.is_terminal,
     )
+
+
+@contextlib.contextmanager
+def steps(console: Console) -> Iterator[Step]:
+    """A progress bar that follows the `Step` it gives."""
+    with progress(console) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda text, done, total: bar.update(task, description=text, completed=done, total=total)

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 
 from jaxtrapolate import __version__
-from jaxtrapolate.commands import check, demo, evaluate, generate, render
+from jaxtrapolate.commands import check, demo, evaluate, generate, render, scenes
 from jaxtrapolate.files import InputError
 
 
@@ -17,7 +17,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"jaxtrapolate {__version__}")
     subparsers = top.add_subparsers(required=True, metavar="COMMAND")
-    for command in (demo, check, generate, evaluate, render):
+    for command in (demo, check, generate, evaluate, render, scenes):
         command.add_parser(subparsers)
     return top
 
@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; 0, or 2 after one line on stderr about input that cannot be used."""
     options = parser().parse_args(arguments)
     try:
-        options.run(options)
+        return options.run(options) or 0
     except InputError as error:
         print(f"jaxtrapolate: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -35,7 +35,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
     except BrokenPipeError:
         return 141
-    return 0
 
 
 if __name__ == "__main__":

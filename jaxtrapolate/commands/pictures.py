@@ -41,6 +41,15 @@ def buffer_picture(name: str, value: Any, sky: Any = None) -> np.ndarray:
     return eight_bit(value)
 
 
+def motion_picture(motion: Any) -> np.ndarray:
+    """Motion as a picture: x in red, y in green, grey where nothing moves."""
+    motion = np.asarray(motion)
+    largest = max(float(np.nanpercentile(np.abs(motion), 99)), 1e-3)
+    return eight_bit(
+        np.concatenate([motion / largest * 0.5 + 0.5, np.full((*motion.shape[:2], 1), 0.5, np.float32)], -1)
+    )
+
+
 def write_pictures(sequence: Sequence, window: Window, methods: dict[str, Method], folder: Path) -> dict[str, Any]:
     """Writes the pictures of a window below `folder/pictures`; returns their paths, relative to `folder`."""
     place = output_folder(str(folder / "pictures" / f"{window.number:04d}"))
@@ -81,8 +90,5 @@ def write_pictures(sequence: Sequence, window: Window, methods: dict[str, Method
             picture = display(value, hdr=True) if name == "sky_color" else value
             pictures["buffers"][name] = put(f"buffer_{name}", buffer_picture(name, picture, shown.sky))
     if window.truth.motion is not None:
-        motion = np.asarray(window.truth.motion)
-        largest = max(float(np.nanpercentile(np.abs(motion), 99)), 1e-3)
-        colors = np.concatenate([motion / largest * 0.5 + 0.5, np.full((*motion.shape[:2], 1), 0.5, np.float32)], -1)
-        pictures["buffers"]["motion"] = put("buffer_motion", eight_bit(colors))
+        pictures["buffers"]["motion"] = put("buffer_motion", motion_picture(window.truth.motion))
     return pictures

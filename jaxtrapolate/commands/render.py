@@ -1,12 +1,11 @@
 """`jaxtrapolate render`: an embedded scene as an Unreal-style EXR dump."""
 
 import argparse
-import re
 from typing import Any
 
 from rich.console import Console
 
-from jaxtrapolate.commands.inputs import output_folder, progress
+from jaxtrapolate.commands.inputs import output_folder, parse_size, progress
 from jaxtrapolate.files import InputError, write_unreal_frame
 
 
@@ -23,14 +22,6 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="varies layout, colours, speeds (0)")
     parser.add_argument("--output", required=True, metavar="DIR", help="for the EXR files")
     parser.set_defaults(run=run)
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """(H, W) from "WxH"."""
-    match = re.fullmatch(r"(\d+)x(\d+)", text)
-    if not match or min(int(g) for g in match.groups()) < 1:
-        raise InputError(f"--size: expected WxH such as 320x180, got {text!r}")
-    return int(match[2]), int(match[1])
 
 
 def run(options: argparse.Namespace) -> None:

@@ -13,3 +13,7 @@ from jaxtrapolate.report.page import write_report as write_report
 from jaxtrapolate.report.plots import plot_causes as plot_causes
 from jaxtrapolate.report.plots import plot_error_time as plot_error_time
 from jaxtrapolate.report.plots import plot_frames as plot_frames
+from jaxtrapolate.report.video import VIDEO_FORMATS as VIDEO_FORMATS
+from jaxtrapolate.report.video import check_video_format as check_video_format
+from jaxtrapolate.report.video import side_by_side as side_by_side
+from jaxtrapolate.report.video import write_video as write_video

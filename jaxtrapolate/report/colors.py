@@ -36,6 +36,7 @@ ERROR_LIMIT = 0.25
 """The error at which an error map is saturated, in display values: a quarter of the way from black to white."""
 
 _ERROR_MAP = "inferno"
+_STEPS = 32  # of the error map, so that pictures stay small: 2 codes of 8 bits each at the usual limit
 _NOT_FINITE = (0, 255, 255)
 
 
@@ -55,8 +56,8 @@ def colorize_error(
         limit: the error at the bright end. The report's legend states `ERROR_LIMIT`, so leave it for pictures there.
 
     Returns:
-        `[H, W, 3]` uint8, matplotlib's "inferno", which is perceptually ordered and readable without colour. Pixels
-        that are not finite are cyan, which the map does not have.
+        `[H, W, 3]` uint8, matplotlib's "inferno" in 33 colours, which is perceptually ordered and readable without
+        colour. Pixels that are not finite are cyan, which the map does not have.
 
     Raises:
         ValueError: another rank, or a limit that is not above 0.
@@ -69,8 +70,8 @@ def colorize_error(
     if error.ndim == 3:
         error = error.mean(-1)
     finite = np.isfinite(error)
-    level = np.clip(np.where(finite, error, 0) * (255 / limit), 0, 255).round().astype(np.uint8)
-    picture = _table()[level]
+    level = np.clip(np.where(finite, error, 0) * (_STEPS / limit), 0, _STEPS).round() * (255 / _STEPS)
+    picture = _table()[level.round().astype(np.uint8)]
     picture[~finite] = _NOT_FINITE
     return picture
 

@@ -20,10 +20,9 @@ from jaxtrapolate.causes import CAUSES
 from jaxtrapolate.files.atomic import atomic_path
 from jaxtrapolate.report import values
 from jaxtrapolate.report.colors import CAUSE_COLORS, CAUSE_TEXTS, ERROR_LIMIT, error_gradient
+from jaxtrapolate.report.pictures import Pictures
 from jaxtrapolate.report.plots import plot_causes, plot_error_time, plot_frames
-from jaxtrapolate.report.values import DASH, MethodResult, items, mapping, number
-
-_KINDS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp", ".gif": "gif"}
+from jaxtrapolate.report.values import DASH, MethodResult, MetricColumn, items, mapping, number
 
 
 def write_report(results: Mapping[str, Any], folder: str | os.PathLike[str]) -> Path:
@@ -66,9 +65,9 @@ def render_report(results: Mapping[str, Any], folder: str | os.PathLike[str]) ->
 
 def _content(results: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Everything that the template shows, as text and plain values."""
-    methods = values.read_methods(results)
+    methods, metrics = values.read_methods(results), values.read_metrics(results)
     best, reference = values.best_method(methods), values.reference_method(methods)
-    pictures = _Pictures(folder)
+    pictures = Pictures(folder)
     shown = [
         _frame(entry, methods, best, reference, pictures) for entry in map(mapping, items(results.get("pictures")))
     ]
@@ -81,13 +80,18 @@ def _content(results: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         "facts": _facts(results, methods),
         "best": best and best.name,
         "reference": reference and reference.name,
-        "methods": _method_rows(methods, best, reference),
+        "methods": _method_rows(methods, metrics, best, reference),
+        "metrics": [column.label for column in metrics],
+        "frame_metrics": [column.label for column in metrics if column.per_frame],
+        "inputs": _input_rows(results, methods),
+        "failed": [str(reason) for reason in mapping(results.get("failed")).values()],
+        "video": _video(results),
         "skipped": {str(k): str(v) for k, v in mapping(results.get("skipped")).items()},
         "causes": _causes(methods),
         "cause_rows": _cause_rows(methods),
         "stages": _stage_rows(methods),
         "frames": [frame for frame in shown if frame["sheet"]],
-        "scores": _score_table(methods),
+        "scores": _score_table(methods, [c for c in metrics if c.per_frame]),
         "plots": {
             "time": _svg_uri(plot_error_time(results)),
             "causes": _svg_uri(plot_causes(results)) if _cause_rows(methods) else None,
@@ -103,12 +107,15 @@ def _content(results: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 def _facts(results: Mapping[str, Any], methods: Sequence[MethodResult]) -> list[str]:
     facts = []
+    if inputs := items(results.get("inputs")):
+        facts.append("each input counts as much as another")
     size = [number(v) for v in items(results.get("size"))]
     if len(size) == 2 and None not in size:
         facts.append(f"{size[1]:g} × {size[0]:g} pixels")
     if results.get("hdr") is not None:
         facts.append("HDR, scored after x/(1+x) and gamma 1/2.2" if results["hdr"] else "8-bit, scored in sRGB")
     count = len(items(results.get("frames"))) or max((len(m.frames) for m in methods), default=0)
+    count = count or sum(int(number(mapping(i).get("frames")) or 0) for i in inputs)
     if count:
         facts.append(f"{count} frame{'s' if count > 1 else ''} held back and scored")
     device = mapping(results.get("machine"))
@@ -123,14 +130,16 @@ def _tops(columns: Sequence[Sequence[float | None]], *, least: Sequence[int] = (
     return [((min if i in least else max)(c) if len(c) > 1 else None) for i, c in enumerate(found)]
 
 
-def _method_rows(methods, best, reference) -> list[dict[str, Any]]:
-    columns = [[m.psnr for m in methods], [m.ssim for m in methods], [m.ms.median for m in methods]]
-    tops = _tops(columns, least=(2,))
+def _method_rows(methods, metrics: Sequence[MetricColumn], best, reference) -> list[dict[str, Any]]:
+    def row_values(m):
+        return (m.psnr, *(m.others[c.name] for c in metrics), m.ms.median)
+
+    least = [i for i, c in enumerate(metrics, 1) if not c.higher] + [len(metrics) + 1]
+    tops = _tops(list(zip(*map(row_values, methods), strict=True)), least=least)
     rows = []
     for m in methods:
-        marks = [
-            top is not None and value == top for value, top in zip((m.psnr, m.ssim, m.ms.median), tops, strict=True)
-        ]
+        marks = [top is not None and value == top for value, top in zip(row_values(m), tops, strict=True)]
+        texts = [values.metric_text(m.others[c.name], c.unit) for c in metrics]
         rows.append(
             {
                 "name": m.name,
@@ -138,7 +147,7 @@ def _method_rows(methods, best, reference) -> list[dict[str, Any]]:
                 "best": m is best and len(methods) > 1,
                 "psnr": values.fixed(m.psnr, 2),
                 "gain": DASH if m is reference else values.fixed(values.gain(m, reference), 2, signed=True),
-                "ssim": values.fixed(m.ssim, 4),
+                "others": list(zip(texts, marks[1:-1], strict=True)),
                 "ms": values.milliseconds(m.ms.median),
                 "iqr": values.milliseconds(m.ms.iqr),
                 "compile": values.duration(m.ms.compile),
@@ -201,20 +210,45 @@ def _stage_rows(methods: Sequence[MethodResult]) -> list[dict[str, Any]]:
     return groups
 
 
-def _score_table(methods: Sequence[MethodResult]) -> list[dict[str, Any]]:
+def _input_rows(results: Mapping[str, Any], methods: Sequence[MethodResult]) -> list[dict[str, Any]]:
+    """dB by input and method, the best of each input marked, and a last row of their means."""
+    rows = []
+    for row in values.read_inputs(results):
+        found = [row.psnr.get(m.name) for m in methods]
+        top = _tops([found])[0]
+        cells = [(values.fixed(v, 2), v is not None and v == top) for v in found]
+        rows.append({"name": row.name, "link": row.link, "detail": row.detail, "cells": cells})
+    if rows:
+        top = _tops([[m.psnr for m in methods]])[0]
+        means = [(values.fixed(m.psnr, 2), m.psnr is not None and m.psnr == top) for m in methods]
+        rows.append({"name": "mean", "link": None, "detail": "", "cells": means})
+    return rows
+
+
+def _video(results: Mapping[str, Any]) -> dict[str, str] | None:
+    """The link to the video."""
+    link = values.relative_link(results.get("video"))
+    return {"link": link, "name": str(results["video"])} if link else None
+
+
+def _score_table(methods: Sequence[MethodResult], metrics: Sequence[MetricColumn]) -> list[dict[str, Any]]:
     scores = {(m.name, f.number): f for m in methods for f in m.frames}
     rows = []
     for index in sorted({f.number for m in methods for f in m.frames}):
         found = [scores.get((m.name, index)) for m in methods]
         cells = [
-            (values.fixed(f and f.psnr, 2), values.fixed(f and f.ssim, 4), values.milliseconds(f and f.ms))
+            (
+                values.fixed(f and f.psnr, 2),
+                *(values.metric_text(f and f.others[c.name], c.unit) for c in metrics),
+                values.milliseconds(f and f.ms),
+            )
             for f in found
         ]
         rows.append({"number": index, "cells": cells})
     return rows
 
 
-def _frame(entry, methods, best, reference, pictures: "_Pictures") -> dict[str, Any]:
+def _frame(entry, methods, best, reference, pictures: Pictures) -> dict[str, Any]:
     """One chosen frame: a sheet of pictures, in pairs one above the other, and which two the slider starts with."""
     index = number(entry.get("number"))
     label = f"{index:g}" if index is not None and math.isfinite(index) else "?"
@@ -257,29 +291,6 @@ def _frame(entry, methods, best, reference, pictures: "_Pictures") -> dict[str, 
     winner = max((s for s in scores.items() if s[1].psnr is not None), key=lambda s: s[1].psnr, default=None)
     summary = f"best: {winner[0]}, {values.fixed(winner[1].psnr)} dB" if winner else ""
     return {"label": label, "sheet": sheet, "buffers": buffers, "left": left, "right": right, "summary": summary}
-
-
-class _Pictures:
-    """Pictures of one folder as data URIs; those that are not there are remembered."""
-
-    def __init__(self, folder: Path):
-        self.folder = folder.resolve()
-        self.missing: list[str] = []
-
-    def uri(self, path: Any) -> str | None:
-        """The picture at a path relative to the folder, None where there is none."""
-        if not isinstance(path, str) or not path:
-            return None
-        try:
-            place = (self.folder / path).resolve()
-            kind = _KINDS.get(place.suffix.lower())
-            if kind is None or not place.is_relative_to(self.folder):
-                raise OSError("not a picture of this folder")
-            content = place.read_bytes()
-        except (OSError, ValueError):
-            self.missing.append(path)
-            return None
-        return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def _svg_uri(svg: bytes) -> str:

@@ -148,7 +148,6 @@
     state();
     view.stage.dispatchEvent(new MouseEvent("dblclick", { clientX: box.left + box.width / 2, clientY: box.top + box.height / 2 }));
     root.dataset.selftestZoom = String(view.view.scale);
-    root.dataset.selftestOverflow = String(root.scrollWidth - root.clientWidth);
     root.dataset.selftest = seen.join(";");
   }
 
@@ -156,5 +155,8 @@
   window.addEventListener("hashchange", openTarget);
   openTarget();
   root.dataset.ready = String(views.length);
-  if (location.hash === "#selftest" && views.length) selfTest(views[0]);
+  if (location.hash === "#selftest") {
+    root.dataset.selftestOverflow = String(root.scrollWidth - root.clientWidth);
+    if (views.length) selfTest(views[0]);
+  }
 })();

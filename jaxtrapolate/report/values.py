@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import quote
 
 from jaxtrapolate.causes import CAUSES
 from jaxtrapolate.report.colors import method_style
@@ -53,12 +54,47 @@ def _positive(value: float | None) -> float | None:
 
 
 @dataclass(frozen=True)
+class MetricColumn:
+    """A metric besides PSNR: its heading, whether more of it is better, and its unit."""
+
+    name: str
+    label: str
+    higher: bool
+    unit: str
+    per_frame: bool
+
+
+def metric_label(name: str, better: str = "higher") -> str:
+    """The heading of a metric's column; an arrow where less is better."""
+    return name.replace("_", " ").upper() + (" ↓" if better == "lower" else "")
+
+
+def metric_text(value: float | None, unit: str = "") -> str:
+    """A metric's value with the digits that tell methods apart."""
+    return fixed(value, 2 if unit == "dB" or (value is not None and abs(value) >= 10) else 4)
+
+
+def read_metrics(results: Mapping[str, Any]) -> list[MetricColumn]:
+    """The metrics besides PSNR, in their order; SSIM where the results do not say."""
+    stated = mapping(results.get("metrics")) if "metrics" in results else {"ssim": {"better": "higher"}}
+    columns = []
+    for name, entry in stated.items():
+        entry = mapping(entry)
+        higher = entry.get("better") != "lower"
+        label = metric_label(str(name), "higher" if higher else "lower")
+        if name != "psnr":
+            unit, per_frame = str(entry.get("unit") or ""), entry.get("per") != "clip"
+            columns.append(MetricColumn(str(name), label, higher, unit, per_frame))
+    return columns
+
+
+@dataclass(frozen=True)
 class Score:
     """The scores of one frame."""
 
     number: int
     psnr: float | None
-    ssim: float | None
+    others: dict[str, float | None]
     ms: float | None
 
 
@@ -68,7 +104,7 @@ class MethodResult:
 
     name: str
     psnr: float | None
-    ssim: float | None
+    others: dict[str, float | None]
     ms: Spread
     by_cause: dict[str, tuple[float | None, float | None]]
     stages: dict[str, Spread]
@@ -84,19 +120,20 @@ def _psnr(entry: Mapping[str, Any]) -> float | None:
     return math.inf if value is None and number(entry.get("ssim")) == 1 else value
 
 
-def _frames(entries: Any) -> list[Score]:
+def _frames(entries: Any, metrics: Sequence[MetricColumn]) -> list[Score]:
     scores = []
     for entry in map(mapping, items(entries)):
         index = number(entry.get("number"))
         if index is not None and math.isfinite(index):
             spent = Spread.read(entry.get("ms")).median
-            scores.append(Score(int(index), _psnr(entry), number(entry.get("ssim")), spent))
+            others = {m.name: number(entry.get(m.name)) for m in metrics}
+            scores.append(Score(int(index), _psnr(entry), others, spent))
     return sorted(scores, key=lambda score: score.number)
 
 
 def read_methods(results: Mapping[str, Any]) -> list[MethodResult]:
     """The methods of the results, in their order."""
-    methods = []
+    methods, metrics = [], read_metrics(results)
     for index, (name, entry) in enumerate(mapping(results.get("methods")).items()):
         entry = mapping(entry)
         by_cause = {}
@@ -109,12 +146,12 @@ def read_methods(results: Mapping[str, Any]) -> list[MethodResult]:
         method = MethodResult(
             name=str(name),
             psnr=_psnr(entry),
-            ssim=number(entry.get("ssim")),
+            others={m.name: number(entry.get(m.name)) for m in metrics},
             ms=Spread.read(entry.get("ms")),
             by_cause=by_cause,
             stages={str(k): Spread.read(v) for k, v in mapping(entry.get("stages")).items()},
             left_out={str(k): [str(i) for i in (v if isinstance(v, (list, tuple)) else [v])] for k, v in left_out},
-            frames=_frames(entry.get("frames")),
+            frames=_frames(entry.get("frames"), metrics),
             color=color,
             marker=marker,
         )
@@ -184,3 +221,32 @@ def headline(methods: Sequence[MethodResult]) -> str:
     if other is not None and difference is not None:
         text += f", {fixed(difference, signed=True)} dB over {other.name}"
     return text
+
+
+@dataclass(frozen=True)
+class InputRow:
+    """One of several inputs: its name, the path of its own report, what it is, and each method's dB."""
+
+    name: str
+    link: str | None
+    detail: str
+    psnr: dict[str, float | None]
+
+
+def read_inputs(results: Mapping[str, Any]) -> list[InputRow]:
+    """The inputs of results over several, in their order."""
+    rows = []
+    for entry in map(mapping, items(results.get("inputs"))):
+        folder, size = entry.get("folder"), [number(v) for v in items(entry.get("size"))]
+        count = number(entry.get("frames"))
+        details = [f"{size[1]:g} × {size[0]:g}"] if len(size) == 2 and None not in size else []
+        details += [f"{count:g} frames"] if count is not None else []
+        psnr = {str(name): _psnr(mapping(scores)) for name, scores in mapping(entry.get("methods")).items()}
+        link = f"{relative_link(folder)}/report.html" if isinstance(folder, str) and folder else None
+        rows.append(InputRow(str(folder or entry.get("input") or "?"), link, ", ".join(details), psnr))
+    return rows
+
+
+def relative_link(path: Any) -> str | None:
+    """A file beside the page as a link: quoted, so that it can be no scheme and no host; None for what is no path."""
+    return quote(path.lstrip("/").encode("utf-8", "replace")) or None if isinstance(path, str) else None

@@ -1,0 +1,101 @@
+"""Evaluating several inputs: each in its own folder, and their means in the folder above."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from jaxtrapolate.commands.inputs import Input, Step, output_folder
+from jaxtrapolate.commands.kept import write_json
+from jaxtrapolate.evaluation import mean_over_inputs
+from jaxtrapolate.files import InputError
+from jaxtrapolate.report import write_report
+from jaxtrapolate.timing import machine
+
+
+def evaluate_many(
+    inputs: list[Input], evaluate: Callable[..., dict[str, Any]], folder: Path, *, step: Step
+) -> tuple[dict[str, Any] | None, dict[str, str]]:
+    """Evaluates inputs one after the other, and writes what they have in common to `folder`.
+
+    Args:
+        inputs: as `named_inputs` gives them.
+        evaluate: of a sequence, with `folder`, `reuse` and `step`.
+        folder: gets a folder for each input, with its own results.json and report.html. An input that an earlier run
+            finished is not run again.
+        step: told how many inputs are done, with fractions.
+
+    Returns:
+        The results over all inputs, None where none could be used; and, by argument, why an input could not be used,
+        which starts with its name.
+    """
+    done: dict[str, dict[str, Any]] = {}
+    failed: dict[str, str] = {}
+    for index, entry in enumerate(inputs):
+        furthest = float(index)
+
+        def follow(text: str, now: float | int, of: float | int, index: int = index, name: str = entry.name) -> None:
+            nonlocal furthest
+            furthest = max(furthest, index + (now / of if text == "evaluate" and of else 0.0))
+            step(f"{name}: {text}", furthest, len(inputs))
+
+        try:
+            follow("read", 0, 1)
+            results = evaluate(entry.open(), folder=output_folder(str(folder / entry.name)), reuse=True, step=follow)
+            done[entry.name] = _entry(entry.name, results)
+        except InputError as error:
+            reason = " ".join(str(error).split())
+            failed[entry.text] = (
+                reason if reason.startswith(entry.text.removesuffix(":0")) else f"{entry.text}: {reason}"
+            )
+    if not done:
+        return None, failed
+    results = over_all(list(done.values()), failed)
+    write_json(folder / "results.json", results)
+    write_report(results, folder)
+    return results, failed
+
+
+def _entry(name: str, results: dict[str, Any]) -> dict[str, Any]:
+    """What the results of all inputs say about one: everything but single frames and stages."""
+    methods = {
+        method: {key: value for key, value in scores.items() if key not in ("frames", "stages", "left_out")}
+        for method, scores in results["methods"].items()
+    }
+    kept = {key: results[key] for key in ("size", "hdr", "settings", "metrics", "skipped")}
+    return kept | {"input": results["input"], "folder": name, "frames": len(results["frames"]), "methods": methods}
+
+
+def over_all(inputs: list[dict[str, Any]], failed: dict[str, str]) -> dict[str, Any]:
+    """The results over all inputs: their table, and for each method the means of `mean_over_inputs`."""
+    first = inputs[0]
+    settings = {k: first["settings"][k] for k in ("version", "methods", "metrics", "frames", "pictures", "video")}
+    methods = mean_over_inputs([i["methods"] for i in inputs], metrics=first["metrics"])
+    in_order = [name for name in settings["methods"] if name in methods]
+    skipped = {}
+    for name in settings["methods"]:
+        if reasons := [i["skipped"][name] for i in inputs if name in i["skipped"]]:
+            skipped[name] = f"on {len(reasons)} of {len(inputs)} inputs: {reasons[0]}"
+    return {
+        "input": f"{len(inputs)} of {len(inputs) + len(failed)} inputs" if failed else f"{len(inputs)} inputs",
+        "machine": machine(),
+        "hdr": first["hdr"] if len({i["hdr"] for i in inputs}) == 1 else None,
+        "size": first["size"] if len({tuple(i["size"]) for i in inputs}) == 1 else None,
+        "settings": settings,
+        "metrics": first["metrics"],
+        "notes": _notes(inputs, methods),
+        "methods": {name: methods[name] for name in in_order},
+        "skipped": skipped,
+        "inputs": [{k: v for k, v in i.items() if k not in ("settings", "metrics")} for i in inputs],
+        "failed": failed,
+    }
+
+
+def _notes(inputs: list[dict[str, Any]], methods: dict[str, Any]) -> list[str]:
+    notes = []
+    counts = {m["inputs"] for m in methods.values()}
+    if counts != {len(inputs)}:
+        over = str(counts.pop()) if len(counts) == 1 else "differing numbers"
+        notes.append(f"means are over {over} of {len(inputs)} inputs: those on which every method ran, none exactly")
+    if len({tuple(i["size"]) for i in inputs}) > 1:
+        notes.append("milliseconds are means over inputs of different sizes")
+    return notes
