@@ -1,9 +1,18 @@
 """Frame extrapolation and interpolation for rendered sequences, as pure jitted JAX functions."""
 
 from jaxtrapolate._version import __version__ as __version__
+from jaxtrapolate.assisted import Interpolation as Interpolation
+from jaxtrapolate.assisted import Offsets as Offsets
+from jaxtrapolate.assisted import interpolate_assisted as interpolate_assisted
+from jaxtrapolate.assisted import overlay as overlay
+from jaxtrapolate.bidirectional import interpolate_bidirectional as interpolate_bidirectional
+from jaxtrapolate.bidirectional import interpolate_run as interpolate_run
 from jaxtrapolate.causes import CAUSES as CAUSES
 from jaxtrapolate.causes import cause_map as cause_map
 from jaxtrapolate.causes import disoccluded as disoccluded
+from jaxtrapolate.flows import CompletedFlows as CompletedFlows
+from jaxtrapolate.flows import camera_flow as camera_flow
+from jaxtrapolate.flows import complete_flows as complete_flows
 from jaxtrapolate.forecast import forecast as forecast
 from jaxtrapolate.gather import backward_warp as backward_warp
 from jaxtrapolate.gather import in_frame as in_frame
@@ -37,3 +46,7 @@ from jaxtrapolate.records import Keyframe as Keyframe
 from jaxtrapolate.records import replace as replace
 from jaxtrapolate.scatter import splat as splat
 from jaxtrapolate.scatter import splat_nearest as splat_nearest
+from jaxtrapolate.search import Correspondence as Correspondence
+from jaxtrapolate.search import dual_start as dual_start
+from jaxtrapolate.search import iterative_search as iterative_search
+from jaxtrapolate.search import latest_start as latest_start

@@ -47,7 +47,7 @@ class Placed:
     """A scene's primitives in the world at one time.
 
     rotation `[P, 3, 3]`, centre `[P, 3]`: pose in the world; size `[P, 3]`; active `[P]`: 0 = left out. poses: of the
-    bodies. counts: (static, dynamic) primitives of each kind.
+    bodies. counts: (aside, static, dynamic) primitives of each kind; see `Scene`.
     """
 
     rotation: Float[Array, "p 3 3"]
@@ -56,7 +56,7 @@ class Placed:
     active: Float[Array, " p"]
     poses: Pose
     field: HeightField | None
-    counts: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
+    counts: tuple[tuple[int, int, int], ...] = dataclasses.field(metadata={"static": True})
 
     @property
     def number(self) -> int:
@@ -87,11 +87,11 @@ def place(scene: Scene, time: Float[Array, ""], hidden: Bool[Array, " b"] | None
     return Placed(world.rotation, world.translation, scene.size, active, poses, scene.field, counts=scene.counts)
 
 
-def _fold(placed: Placed, step: Callable, state: Array, *, static: bool = True, dynamic: bool = True) -> Array:
-    """state = step(kind, state, row) over all primitives, or the static or dynamic ones; one loop for each kind."""
+def _fold(placed: Placed, step: Callable, state: Array, *, groups: tuple[int, ...] = (0, 1, 2)) -> Array:
+    """state = step(kind, state, row) over the primitives of adjacent groups of `counts`; one loop for each kind."""
     first = 0
-    for kind, (still, moving) in zip(KINDS, placed.counts, strict=True):
-        rows = slice(first if static else first + still, first + still + (moving if dynamic else 0))
+    for kind, counts in zip(KINDS, placed.counts, strict=True):
+        rows = slice(first + sum(counts[: groups[0]]), first + sum(counts[: groups[-1] + 1]))
         if rows.stop > rows.start:
             numbers = jnp.arange(rows.start, rows.stop, dtype=jnp.int32)
             table = (placed.rotation[rows], placed.centre[rows], placed.size[rows], placed.active[rows], numbers)
@@ -100,7 +100,7 @@ def _fold(placed: Placed, step: Callable, state: Array, *, static: bool = True, 
                 return step(kind, state, row), None
 
             state, _ = jax.lax.scan(body, state, table)
-        first += still + moving
+        first += sum(counts)
     return state
 
 
@@ -173,8 +173,8 @@ def light_visibility(
         counts = (t > 0) & (t < end) & (row[3] > 0) & (row[4] != own)
         return jnp.minimum(state, jnp.where(counts, through, 1.0))
 
-    static = _fold(placed, step, jnp.ones_like(o.x), dynamic=False)
-    dynamic = _fold(placed, step, jnp.ones_like(o.x), static=False)
+    static = _fold(placed, step, jnp.ones_like(o.x), groups=(1,))
+    dynamic = _fold(placed, step, jnp.ones_like(o.x), groups=(2,))
     if placed.field is not None:
         # A terrain does shadow itself: its rays start a little above it.
         lifted = Vector(o.x, o.y, o.z + jnp.where(own == placed.number, 2e-3, 0.0))

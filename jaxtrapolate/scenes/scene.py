@@ -104,9 +104,10 @@ class CameraPath:
 class Scene:
     """Everything that `render` needs; made by `scene`.
 
-    Primitives are numbered shape by shape in the order of `primitives.KINDS`, static ones first in each, then the
+    Primitives are numbered shape by shape in the order of `primitives.KINDS`, as in `counts` in each, then the
     height field. rotation `[P, 3, 3]`, centre `[P, 3]`: pose in the body's space. size `[P, 3]`: see `primitives`.
-    material `[P(+1), M]`: see `MATERIAL`. counts: (static, dynamic) primitives of each kind. body: of each primitive.
+    material `[P(+1), M]`: see `MATERIAL`. counts: (aside, static, dynamic) primitives of each kind; those aside are static
+    and block no light. body: of each primitive.
     bounce: whether glossy surfaces reflect; sun: whether there is one; water: whether a material has ripples.
     """
 
@@ -119,7 +120,7 @@ class Scene:
     lights: Lights
     sky: Sky
     camera: CameraPath
-    counts: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
+    counts: tuple[tuple[int, int, int], ...] = dataclasses.field(metadata={"static": True})
     body: tuple[int, ...] = dataclasses.field(metadata={"static": True})
     bounce: bool = dataclasses.field(metadata={"static": True})
     sun: bool = dataclasses.field(metadata={"static": True})
@@ -201,11 +202,25 @@ class Builder:
         return len(self._parents) - 1
 
     def add(
-        self, kind: str, centre: object, size: object, surface: np.ndarray, *, body: int = 0, rotation: object = None
+        self,
+        kind: str,
+        centre: object,
+        size: object,
+        surface: np.ndarray,
+        *,
+        body: int = 0,
+        rotation: object = None,
+        blocks: bool | None = None,
     ) -> None:
-        """A primitive on a body; rotation: `[3, 3]`, its own space to the body's."""
+        """A primitive on a body; rotation: `[3, 3]`, its own space to the body's.
+
+        blocks: whether it may block light; all do but planes, which lie below all lights. A static one that cannot (the
+        wall of a room that is lit from within) saves the time to find that out.
+        """
         pose = np.eye(3) if rotation is None else rotation
-        self._primitives[kind].append((_array(pose, (3, 3)), _array(centre, (3,)), _array(size, (3,)), surface, body))
+        may = kind != "plane" if blocks is None else blocks
+        row = (_array(pose, (3, 3)), _array(centre, (3,)), _array(size, (3,)), surface, body, may)
+        self._primitives[kind].append(row)
 
     def limb(self, start: object, end: object, radius: float, surface: np.ndarray, *, body: int = 0) -> None:
         """A capsule between two points."""
@@ -243,11 +258,11 @@ class Builder:
         bounce: bool = True,
     ) -> Scene:
         """The scene, its leaves float32 arrays of JAX."""
-        dynamic = {kind: [self._stencils[row[4]] > 0 for row in self._primitives[kind]] for kind in KINDS}
-        counts = tuple((len(moving) - sum(moving), sum(moving)) for moving in dynamic.values())
-        rows = []
-        for kind, moving in dynamic.items():
-            rows += [self._primitives[kind][k] for k in np.argsort(moving, kind="stable")]
+        counts, rows = [], []
+        for kind in KINDS:
+            group = [2 if self._stencils[row[4]] > 0 else int(row[5]) for row in self._primitives[kind]]
+            counts.append((group.count(0), group.count(1), group.count(2)))
+            rows += [self._primitives[kind][k] for k in np.argsort(group, kind="stable")]
         if len(rows) > LIMIT:
             raise ValueError(f"a scene holds at most {LIMIT} primitives, got {len(rows)}")
         surfaces = [row[3] for row in rows] + ([] if self._field is None else [self._field[1]])
@@ -279,7 +294,7 @@ class Builder:
             lights=lights,
             sky=sky,
             camera=camera,
-            counts=counts,
+            counts=tuple(counts),
             body=tuple(row[4] for row in rows),
             bounce=bounce,
             sun=bool(np.any(lights.sun_color > 0)),

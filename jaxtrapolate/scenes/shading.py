@@ -80,11 +80,13 @@ def _geometry(placed: Placed, hit: Hit, position: Vector, d: Vector) -> tuple[Ve
         centre, size = jnp.concatenate([centre, jnp.zeros((1, 3))]), jnp.concatenate([size, jnp.ones((1, 3))])
     pick, pick3 = _picker(hit.primitive)
     to_world = tuple(tuple(pick(rotation[:, row, column]) for column in range(3)) for row in range(3))
-    local = rotate_back(to_world, position - pick3(centre))
-    n = rotate(to_world, normal(pick(kinds), local, rotate_back(to_world, d), pick3(size)))
+    local = stage(lambda position, d: (rotate_back(to_world, position - pick3(centre)), rotate_back(to_world, d)))
+    at, ray = local(position, d)
+    n = stage(lambda at, ray: normal(pick(kinds), at, ray, pick3(size)))(at, ray)
+    n = stage(lambda n: rotate(to_world, n))(n)
     if placed.field is not None:
         n = select(hit.primitive == number, placed.field.normal(position.x, position.y), n)
-    return n, local, to_world
+    return n, at, to_world
 
 
 def surface_normal(placed: Placed, hit: Hit, position: Vector, d: Vector) -> Vector:
@@ -106,17 +108,19 @@ def surface(scene: Scene, placed: Placed, time: Array, o: Vector, d: Vector, hit
 
     found = hit.t < jnp.inf
 
-    @stage
-    def at(hit: Hit, o: Vector, d: Vector) -> tuple[Vector, Vector, Vector, Vector, Array]:
-        t = jnp.where(hit.t < jnp.inf, hit.t, 1.0)
-        position = o + d * t
-        n, local, to_world = _geometry(placed, hit, position, d)
-        edges = [rotate_back(to_world, edge) for edge in spread(t, n)]
-        width = (edges[0] * edges[0] + edges[1] * edges[1]).map(jnp.sqrt)
-        size_of = jnp.sqrt(jnp.maximum(edges[0].dot(edges[0]), edges[1].dot(edges[1])))
-        return position, n, local, width, size_of
+    # In steps, each kept: the three coordinates of a result would each compute all steps before it.
+    t = jnp.where(found, hit.t, 1.0)
+    position = stage(lambda o, d, t: o + d * t)(o, d, t)
+    n, local, to_world = _geometry(placed, hit, position, d)
+    edges = stage(spread)(t, n)
 
-    position, n, local, width, size_of = at(hit, o, d)
+    @stage
+    def footprint(first: Vector, second: Vector) -> tuple[Vector, Array]:
+        a, b = rotate_back(to_world, first), rotate_back(to_world, second)
+        size_of = jnp.sqrt(jnp.maximum(first.dot(first), second.dot(second)))
+        return (a * a + b * b).map(jnp.sqrt), size_of
+
+    width, size_of = footprint(*edges)
     texture = textures.Texture(
         material["frequency"], material["offset"], material["duty"], material["tiled"], material["noise_frequency"]
     )
@@ -280,7 +284,9 @@ def rippled(s: Surface, time: Array) -> Vector:
     slope_x, slope_y = jnp.zeros_like(s.width), jnp.zeros_like(s.width)
     for k, (x, y, speed) in enumerate(((0.9, 0.35, 0.02), (-0.5, 1.1, 0.017), (1.7, -1.2, 0.03), (2.6, 2.3, 0.041))):
         frequency = float(np.hypot(x, y))
-        wave = jnp.cos(2 * jnp.pi * (x * s.position.x + y * s.position.y + speed * time) + k)
+        phase = x * s.position.x + y * s.position.y + speed * time + 0.16 * k
+        phase -= jnp.floor(phase + 0.5)
+        wave = 8 * phase * (1 - 2 * jnp.abs(phase))  # parabolas, as in `field`
         wave *= jnp.clip(1.5 - 2 * s.width * frequency, 0.0, 1.0) * s.ripple
         slope_x, slope_y = slope_x + wave * x / frequency, slope_y + wave * y / frequency
     return (s.normal + Vector(-slope_x, -slope_y, jnp.zeros_like(slope_x))).normalized()

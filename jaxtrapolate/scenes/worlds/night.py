@@ -39,10 +39,10 @@ def interior(rng: np.random.Generator) -> Scene:
             (0.3, 7.5, 2.2),
             wall,
             rotation=yaw(k * np.pi / 2),
+            blocks=False,
         )
-    b.add(
-        "box", (0, 0, 4.3), (8, 8, 0.2), material(0.7 * plaster, frequency=(0.5, 0, 0), color_b=0.3 * plaster, duty=0.2)
-    )
+    beams = material(0.7 * plaster, frequency=(0.5, 0, 0), color_b=0.3 * plaster, duty=0.2)
+    b.add("box", (0, 0, 4.3), (8, 8, 0.2), beams, blocks=False)
     start = rng.uniform(0, 2 * np.pi)
     pillar = material(common.shifted(rng, (0.48, 0.42, 0.36)), noise=0.3, noise_frequency=2, roughness=0.6)
     for k in range(5):
@@ -113,20 +113,20 @@ def street(rng: np.random.Generator) -> Scene:
             roughness_b=0.7,
             emission=lit * 0.5,
         )
-        b.add("box", (r * np.cos(a), r * np.sin(a), size[2]), size, house, rotation=yaw(a))
+        b.add("box", (r * np.cos(a), r * np.sin(a), size[2]), size, house, rotation=yaw(a), blocks=False)
     iron = material((0.05, 0.05, 0.05), roughness=0.35)
     for k in range(4):
         a = start + 2 * np.pi * (k + 0.5) / 4
         x, y = 4.4 * np.cos(a), 4.4 * np.sin(a)
         b.limb((x, y, 0), (x, y, 3.6), 0.07, iron)
-        if k < 3:
-            color = np.array([(1.0, 0.62, 0.3), (0.55, 0.75, 1.0), (1.0, 0.45, 0.25)][k])
+        if k % 2 == 0:
+            color = np.array([(1.0, 0.62, 0.3), (0.6, 0.75, 1.0)][k // 2])
             lamp = b.lamp(
                 path((0.92 * x, 0.92 * y, 3.45)),
-                color * rng.uniform(13, 18),
+                color * rng.uniform(17, 22),
                 radius=0.08,
-                flicker=(0.95, 0.0, 0.8)[k],
-                period=(3.0, 1.0, 7.0)[k],
+                flicker=(0.95, 0.5)[k // 2],
+                period=(3.0, 7.0)[k // 2],
                 duty=0.55,
             )
             b.add("sphere", (x, y, 3.75), (0.2, 0.2, 0.2), material((0.2, 0.2, 0.2), emission=color * 12, lamp=lamp))

@@ -1,0 +1,265 @@
+"""Scene-assisted interpolation (Yang et al. 2011, section 4), and what it shares with the image-based one.
+
+The geometry of the frame to be made is drawn without shading: its depth, and where its points are in the two rendered
+frames around it. Colours come from there, where a depth test finds the point visible.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image, check_present
+from jaxtrapolate.gather import Filter, sample, weigh, where_finite
+from jaxtrapolate.records import Keyframe, record, replace
+from jaxtrapolate.search import Correspondence, check_scalar, positions, within
+
+Shader = Callable[[Array], Array]
+DepthKind = Literal["metric", "ordinal"]
+
+CASES = ("agree", "nearer", "one", "neither", "assisted", "missed", "rendered")
+"""How a pixel was made; `Interpolation.case` gives indices into this.
+
+Image-based (5.2): both searches hit the same point; both hit, and the nearer point was taken; one hit; neither did.
+Scene-assisted (4): the point is visible in at least one of the frames around; in neither. "rendered": drawn anew (6).
+"""
+
+
+@record
+@dataclasses.dataclass(frozen=True)
+class Offsets:
+    """What the searches of one interpolated frame leave for those of the next (5.3, latest-frame initialization).
+
+    forward, backward `[H, W, 2]`: p - position in the I-frame before and after. forward_depth, backward_depth
+    `[H, W, 1]`: of the points found, infinite where the search missed; `None` without depth. alpha: of that frame.
+    """
+
+    alpha: Float[Array, ""]
+    forward: Float[Array, "h w 2"]
+    backward: Float[Array, "h w 2"]
+    forward_depth: Float[Array, "h w 1"] | None = None
+    backward_depth: Float[Array, "h w 1"] | None = None
+
+
+@record
+@dataclasses.dataclass(frozen=True)
+class Interpolation:
+    """An interpolated frame and how it came about.
+
+    color `[H, W, C]`. weight `[H, W, 1]`: that of the next frame's colour: alpha where both are blended, 0 or 1 where
+    one was taken alone. case `[H, W]`: index into `CASES`. forward, backward: the point's place in the frame before and
+    after, as searched or as given by the scene. depth `[H, W, 1]`: in the frame made; `None` without depth. offsets:
+    for the next frame's searches.
+    """
+
+    color: Float[Array, "h w c"]
+    weight: Float[Array, "h w 1"]
+    case: Int[Array, "h w"]
+    forward: Correspondence
+    backward: Correspondence
+    depth: Float[Array, "h w 1"] | None = None
+    offsets: Offsets | None = None
+
+
+def fetch_finite(image: Float[Array, "h w c"], at: Float[Array, "i j 2"], filter: Filter) -> Float[Array, "i j c"]:
+    """The image at finite positions; a pixel that is not finite does not spread to where it has no weight."""
+
+    def look(product, image, at):
+        return sample(image, at[..., 0], at[..., 1], filter=filter, product=product)
+
+    return look(None, image, at) if filter == "nearest" else where_finite(look, image, at)
+
+
+def blend(
+    first: Float[Array, "h w c"], second: Float[Array, "h w c"], weight: Float[Array, "h w 1"]
+) -> Float[Array, "h w c"]:
+    """(1 - weight) first + weight second (eq. 13-15); at 0 and 1 one of them bit for bit, whatever the other is."""
+    wide = jnp.promote_types(first.dtype, weight.dtype)
+    weight = weight.astype(wide)
+    return (weigh(first.astype(wide), 1 - weight) + weigh(second.astype(wide), weight)).astype(first.dtype)
+
+
+def agree(found: Array, expected: Array, epsilon: Array, kind: DepthKind) -> Bool[Array, "*n"]:
+    """Whether two depths are of one point: they differ by less than epsilon, relative to the smaller if metric.
+
+    Infinite depths of one sign agree; a NaN agrees with nothing.
+    """
+    scale = jnp.minimum(jnp.abs(found), jnp.abs(expected)) if kind == "metric" else jnp.ones_like(found)
+    return (found == expected) | (jnp.abs(found - expected) < epsilon * scale)
+
+
+def shown(
+    depth: Float[Array, "h w 1"],
+    at: Float[Array, "i j 2"],
+    expected: Float[Array, "i j 1"],
+    epsilon: Array,
+) -> Bool[Array, "i j 1"]:
+    """Whether a point of the expected depth is what a frame shows at `at`: inside, and its depth agrees."""
+    found = sample(depth, at[..., 0], at[..., 1]).astype(expected.dtype)
+    return within(at, *depth.shape[:2])[..., None] & agree(found, expected, epsilon, "metric")
+
+
+def check_keyframe(name: str, value: Keyframe, *, size: Size | None = None) -> Size:
+    """The size of a keyframe's images; raises where one differs or there is no colour, and on what is no `Keyframe`."""
+    if not isinstance(value, Keyframe):
+        raise TypeError(f"{name}: expected a Keyframe, got {type(value).__name__}")
+    color = check_present(f"{name}.color", value.color, needed_by="interpolation")
+    size = check_image(f"{name}.color", color, size=size)
+    if value.depth is not None:
+        check_image(f"{name}.depth", value.depth, size=size, channels=1)
+    return size
+
+
+def check_target(target: Keyframe, *, size: Size) -> None:
+    """Raise unless a target has depth and both 3D flows."""
+    if not isinstance(target, Keyframe):
+        raise TypeError(f"target: expected a Keyframe, got {type(target).__name__}")
+    for name, channels in (("depth", 1), ("forward_flow", 3), ("backward_flow", 3)):
+        value = check_present(f"target.{name}", getattr(target, name), needed_by="scene-assisted interpolation")
+        check_image(f"target.{name}", value, size=size, channels=channels)
+
+
+@partial(jax.jit, static_argnames=("shader", "shade", "filter"))
+def _assisted(previous, next, target, alpha, epsilon, *, shader, shade, filter):
+    height, width, _ = previous.color.shape
+    wide = jnp.promote_types(target.forward_flow.dtype, jnp.float32)
+    alpha, epsilon = (jnp.asarray(a).astype(wide) for a in (alpha, epsilon))
+    depth = target.depth.astype(wide)
+    ways = []
+    for frame, flow in ((previous, target.backward_flow), (next, target.forward_flow)):
+        flow = flow.astype(wide)
+        finite = jnp.all(jnp.isfinite(flow), -1, keepdims=True)
+        flow = jnp.where(finite, flow, 0)
+        at = positions(height, width, wide) + flow[..., :2]
+        visible = finite & shown(frame.depth, at, depth + flow[..., 2:], epsilon)
+        there = sample(frame.depth, at[..., 0], at[..., 1]).astype(wide)
+        found = Correspondence(at, -flow[..., 2:], jnp.where(finite, 0, jnp.inf).astype(wide))
+        ways.append((fetch_finite(frame.color, at, filter), visible, there, found))
+    (first, in_first, first_depth, forward), (second, in_second, second_depth, backward) = ways
+    closest = jnp.where(second_depth < first_depth, 1, 0).astype(wide)  # closest-on-miss
+    one = jnp.where(in_first == in_second, closest, jnp.where(in_second, 1, 0).astype(wide))
+    weight = jnp.where(in_first & in_second, alpha, one)
+    color = blend(first, second, weight)
+    missed = ~(in_first | in_second)
+    color = color if shade is None else shade(color)
+    if shader is not None:
+        color = jnp.where(missed, shader(missed[..., 0]).astype(color.dtype), color)
+    case = jnp.where(missed[..., 0], CASES.index("missed"), CASES.index("assisted")).astype(jnp.int32)
+    return Interpolation(color, weight, case, forward, backward, depth)
+
+
+def interpolate_assisted(
+    previous: Keyframe,
+    next: Keyframe,
+    target: Keyframe,
+    alpha: float | Float[ArrayLike, ""],
+    *,
+    epsilon_depth: float | Float[ArrayLike, ""] = 0.05,
+    filter: Filter = "bilinear",
+    shader: Shader | None = None,
+    shade: Shader | None = None,
+) -> Interpolation:
+    """The frame at t + alpha from its geometry, and the colours of the rendered frames before and after it.
+
+    Each point is looked up in both frames, and counts as visible where it lands inside and the depth there agrees with
+    its own: visible in both, the colours are blended by alpha; in one, that colour is taken; in neither, what `shader`
+    says (shade-on-miss) or the nearer of the two (closest-on-miss).
+
+    Args:
+        previous, next: with color `[H, W, C]`, any attributes, and depth.
+        target: of the frame to be made: depth, backward_flow to `previous`, forward_flow to `next`, exact; see
+            `camera_flow`. Its color is not looked at.
+        alpha: in 0..1, traced.
+        epsilon_depth: how far depths of one point may differ, relative to the smaller.
+        filter: of the colours, as in `backward_warp`.
+        shader: called with the mask `[H, W]` of the pixels visible in neither frame, gives their colour `[H, W, C']`.
+        shade: called with the blended attributes, gives the colour `[H, W, C']`.
+
+    Returns:
+        An `Interpolation` without offsets.
+
+    Convention:
+        The target's flows belong to its own grid, and are added; depth is along the view axis, metric.
+
+    Edge cases:
+        Flow or depth that is not finite (but depths that are infinite in both) is visible nowhere; non-finite flow
+        looks at the pixel itself. What is outside a frame is not visible in it; closest-on-miss repeats the frame's
+        edge there, and takes the earlier frame where depths are equal or unknown.
+
+    Gradient:
+        With respect to colours, flows and alpha; which pixels are visible is held fixed.
+
+    Raises:
+        TypeError, ValueError: a field is absent, no floating-point array, or of another size; an unknown option.
+
+    References:
+        Yang et al. 2011, section 4; Nehab et al. 2007. Departure: depths are compared relatively.
+    """
+    size = check_keyframe("previous", previous)
+    check_keyframe("next", next, size=size)
+    for name, frame in (("previous", previous), ("next", next)):
+        check_present(f"{name}.depth", frame.depth, needed_by="scene-assisted interpolation")
+    check_target(target, size=size)
+    check_scalar("alpha", alpha)
+    check_choice("filter", filter, get_args(Filter))
+    previous, next = (Keyframe(color=f.color, depth=f.depth) for f in (previous, next))
+    target = replace(target, color=None, stencil=None, time=None)
+    return _assisted(previous, next, target, alpha, epsilon_depth, shader=shader, shade=shade, filter=filter)
+
+
+def drawn_over(below: Interpolation, above: Interpolation, covered: Array, epsilon: Array) -> Interpolation:
+    """`below`, with what `above` has where it is covered and not hidden."""
+    drawn = covered[..., None]
+    depth = below.depth
+    if depth is not None and above.depth is not None:
+        over = above.depth.astype(depth.dtype)
+        drawn &= (over <= depth) | agree(over, depth, epsilon, "metric")
+        depth = jnp.where(drawn, over, depth)
+    return replace(
+        below,
+        color=jnp.where(drawn, above.color.astype(below.color.dtype), below.color),
+        weight=jnp.where(drawn, above.weight.astype(below.weight.dtype), below.weight),
+        case=jnp.where(drawn[..., 0], above.case, below.case),
+        depth=depth,
+    )
+
+
+@jax.jit
+def overlay(
+    below: Interpolation,
+    color: Float[ArrayLike, "h w c"],
+    depth: Float[ArrayLike, "h w 1"],
+    covered: Bool[ArrayLike, "h w"],
+    *,
+    epsilon_depth: float | Float[ArrayLike, ""] = 0.05,
+) -> Interpolation:
+    """Pixels that were rendered anew, drawn over an interpolated frame through one depth buffer (Figure 4).
+
+    Args:
+        below: the interpolated frame, as a rule made of I-frames that leave out what is drawn now.
+        color: `[H, W, C]`. depth: `[H, W, 1]`. covered: `[H, W]`, where something was rendered.
+        epsilon_depth: by how much, relative to the smaller depth, it may lie behind and still be drawn.
+
+    Returns:
+        `below` with color, depth and case exchanged where something was drawn that is not hidden. Without a depth below
+        nothing hides it; a NaN depth is hidden.
+
+    Gradient:
+        With respect to both colours and depths as picked; the pick is held fixed.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, or a shape that does not fit.
+
+    References:
+        Yang et al. 2011, section 6.
+    """
+    size = check_image("below.color", below.color)
+    check_image("color", color, size=size, channels=below.color.shape[2])
+    check_image("depth", depth, size=size, channels=1)
+    case = jnp.full(size, CASES.index("rendered"), below.case.dtype)
+    above = replace(below, color=jnp.asarray(color), depth=jnp.asarray(depth), case=case)
+    return drawn_over(below, above, jnp.asarray(covered), jnp.asarray(epsilon_depth).astype(below.weight.dtype))

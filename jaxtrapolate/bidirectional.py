@@ -1,0 +1,432 @@
+"""Image-based bidirectional reprojection (Yang et al. 2011, sections 5 and 6).
+
+A frame between two rendered ones, the I-frames at t and t + 1, is made from their colours, depths and 3D flows alone:
+each of its pixels searches for its point in both, the visible one is chosen and, where the other I-frame shows it as
+well, the two colours are blended.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxtrapolate.assisted import (
+    CASES,
+    DepthKind,
+    Interpolation,
+    Offsets,
+    Shader,
+    agree,
+    blend,
+    check_keyframe,
+    drawn_over,
+    fetch_finite,
+    interpolate_assisted,
+    shown,
+)
+from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image, check_present
+from jaxtrapolate.gather import Filter, sample
+from jaxtrapolate.records import Keyframe, replace
+from jaxtrapolate.search import (
+    Correspondence,
+    FlowFilter,
+    Solver,
+    check_flow,
+    check_scalar,
+    check_search,
+    dual_start,
+    latest_start,
+    positions,
+    search,
+    within,
+)
+
+Start = Literal["default", "dual", "latest"]
+Choice = Literal["error", "depth"]
+Visibility = Literal["auto", "depth", "round_trip", "inside"]
+TargetMode = Literal["reproject", "render"]
+
+_EQUAL = 1e-3  # pixels: errors that differ by less do so by rounding
+
+
+class _Found(NamedTuple):
+    """One solution of a search `[H, W, ...]`: place, whole flow and error there, depth in the frame to be made, hit."""
+
+    at: Array
+    flow: Array
+    error: Array
+    depth: Array
+    hit: Array
+
+
+class _Options(NamedTuple):
+    """What is static."""
+
+    starts: tuple[Start, ...]
+    iterations: int
+    solver: Solver
+    flow_filter: FlowFilter
+    filter: Filter
+    choice: Choice
+    depth: Literal["metric", "ordinal", "absent"]
+    visibility: Literal["depth", "round_trip", "inside"]
+    reach: int
+
+
+def _choose(best: _Found, other: _Found, choice: Choice) -> Array:
+    """Where the other solution is better: the smaller error (5.3), inside the frame first; or nearer, if both hit."""
+    closer = other.error < best.error - _EQUAL
+    if choice == "depth":
+        closer = jnp.where(other.hit & best.hit, other.depth < best.depth, closer)
+    height, width = other.at.shape[:2]
+    inner, best_inner = (within(f.at, height, width)[..., None] for f in (other, best))
+    return jnp.where(inner == best_inner, closer, inner)
+
+
+def _find(frame, flow, fraction, starts, epsilon, options: _Options) -> _Found:
+    """The best solution of all starts in one I-frame."""
+    height, width, channels = flow.shape
+
+    def solve(start):
+        how = {"iterations": options.iterations, "solver": options.solver, "filter": options.flow_filter}
+        at, value, error = search(flow, fraction, start, **how)
+        hit = (error < epsilon) & within(at, height, width)[..., None]
+        depth = jnp.zeros_like(error)
+        if options.depth != "absent":
+            # from the same pixels as the flow, whose change of depth is theirs
+            depth = sample(frame.depth, at[..., 0], at[..., 1], filter=options.flow_filter).astype(at.dtype)
+        if options.depth == "metric" and channels == 3:
+            depth = depth + fraction * value[..., 2:]  # eq. 6 and 11
+        return _Found(at, value, error, jnp.where(jnp.isnan(depth), jnp.inf, depth), hit)
+
+    def step(best, given):
+        first, start = given
+        found = solve(start)
+        better = first | _choose(best, found, options.choice)
+        return _Found(*(jnp.where(better, a, b) for a, b in zip(found, best, strict=True))), None
+
+    number = len(starts)
+    empty = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(solve, starts[0]))
+    # a loop, because XLA on a CPU would make every solution anew for each that is compared with it
+    return jax.lax.scan(step, empty, (jnp.arange(number) == 0, jnp.stack(starts)))[0]
+
+
+def _starts(options: _Options, fraction, opposite, offset, depth, ratio):
+    """Positions to start from (5.3)."""
+    grid = positions(opposite.shape[0], opposite.shape[1], opposite.dtype)
+    places = []
+    for name in options.starts:
+        if name == "default":
+            places.append(grid)
+        elif name == "dual":
+            places.append(dual_start(opposite, fraction))
+        elif offset is not None:
+            places.append(latest_start(offset, ratio, depth=depth, reach=options.reach).astype(grid.dtype))
+    return places or [grid]
+
+
+def _visible_in(other, opposite, found: _Found, fraction, epsilon_depth, epsilon_trip, options: _Options):
+    """Whether a point found in one I-frame is seen in the other (5.2): its place there, and the answer `[H, W, 1]`."""
+    there = found.at + found.flow[..., :2]
+    seen = within(there, *other.color.shape[:2])[..., None] & (found.error < jnp.inf)
+    if options.visibility == "depth":
+        expected = found.depth + (1 - fraction) * found.flow[..., 2:]
+        seen &= shown(other.depth, there, expected, epsilon_depth)
+    elif options.visibility == "round_trip":
+        back = sample(opposite, there[..., 0], there[..., 1], filter=options.flow_filter).astype(there.dtype)
+        apart = found.flow[..., :2] + back[..., :2]
+        seen &= jnp.sum(jnp.square(apart), -1, keepdims=True) < jnp.square(epsilon_trip)
+    return there, seen
+
+
+def _ratio(now, then):
+    """now / then, 0 where then is 0: the offsets of that frame are 0 as well."""
+    return jnp.where(then > 0, now / jnp.where(then > 0, then, 1), 0)
+
+
+@partial(jax.jit, static_argnames=("options", "shade"))
+def _interpolate(previous, next, alpha, offsets, epsilon_error, epsilon_depth, epsilon_trip, *, options, shade):
+    flow, opposite = previous.forward_flow, next.backward_flow
+    height, width, channels = flow.shape
+    wide = jnp.promote_types(jnp.promote_types(flow.dtype, opposite.dtype), jnp.float32)
+    flow, opposite = flow.astype(wide), opposite.astype(wide)
+    numbers = (alpha, epsilon_error, epsilon_depth, epsilon_trip)
+    alpha, epsilon_error, epsilon_depth, epsilon_trip = (jnp.asarray(a).astype(wide) for a in numbers)
+    beta = 1 - alpha
+    carried = (None,) * 6
+    if offsets is not None:
+        last = offsets.alpha.astype(wide)
+        carried = (offsets.forward, offsets.forward_depth, _ratio(alpha, last))
+        carried += (offsets.backward, offsets.backward_depth, _ratio(beta, 1 - last))
+    forward_starts = _starts(options, alpha, opposite, *carried[:3])
+    backward_starts = _starts(options, beta, flow, *carried[3:])
+    f = _find(previous, flow, alpha, forward_starts, epsilon_error, options)
+    b = _find(next, opposite, beta, backward_starts, epsilon_error, options)
+
+    # 5.2: which of the two points is the one to be seen
+    same = jnp.ones_like(f.hit)
+    if options.depth != "absent":
+        same = agree(f.depth, b.depth, epsilon_depth, options.depth)
+    f_inside, b_inside = (within(a.at, height, width)[..., None] for a in (f, b))
+    apart = f.error - b.error
+    smaller = jnp.where(jnp.abs(apart) < _EQUAL, alpha < 0.5, apart < 0)
+    smaller = jnp.where(f_inside == b_inside, smaller, f_inside)
+    by_error = jnp.where(f.hit == b.hit, smaller, f.hit)
+    take_f = jnp.where(f.hit & b.hit & ~same, f.depth < b.depth, by_error)
+    take_f = jnp.where(alpha == 0, True, jnp.where(alpha == 1, False, take_f))
+    case = jnp.where(same, CASES.index("agree"), CASES.index("nearer"))
+    case = jnp.where(f.hit & b.hit, case, jnp.where(f.hit | b.hit, CASES.index("one"), CASES.index("neither")))
+
+    # eq. 14 and 15: that point in both I-frames, blended where both show it
+    f_there, f_seen = _visible_in(next, opposite, f, alpha, epsilon_depth, epsilon_trip, options)
+    b_there, b_seen = _visible_in(previous, flow, b, beta, epsilon_depth, epsilon_trip, options)
+    first, second = jnp.where(take_f, f.at, b_there), jnp.where(take_f, f_there, b.at)
+    both = jnp.where(take_f, f_seen, b_seen)
+    weight = jnp.where(both, alpha, jnp.where(take_f, 0, 1).astype(wide))
+    first_color, second_color = (
+        fetch_finite(frame.color, at, options.filter) for frame, at in ((previous, first), (next, second))
+    )
+    color = blend(first_color, second_color, weight)
+    color = color if shade is None else shade(color)
+
+    grid = positions(height, width, wide)
+    known = options.depth != "absent"
+    left = Offsets(
+        alpha,
+        grid - f.at,
+        grid - b.at,
+        jnp.where(f.hit, f.depth, jnp.inf) if known else None,
+        jnp.where(b.hit, b.depth, jnp.inf) if known else None,
+    )
+    forward = Correspondence(f.at, alpha * f.flow[..., 2:] if channels == 3 else None, f.error)
+    backward = Correspondence(b.at, beta * b.flow[..., 2:] if opposite.shape[2] == 3 else None, b.error)
+    depth = jnp.where(take_f, f.depth, b.depth) if known else None
+    return Interpolation(color, weight, case[..., 0].astype(jnp.int32), forward, backward, depth, left)
+
+
+def _checked(previous: Keyframe, next: Keyframe) -> Size:
+    size = check_keyframe("previous", previous)
+    check_keyframe("next", next, size=size)
+    hint = "interpolation (`complete_flows` derives one from the other)"
+    for name, flow in (("previous.forward_flow", previous.forward_flow), ("next.backward_flow", next.backward_flow)):
+        check_flow(name, check_present(name, flow, needed_by=hint), size=size)
+    return size
+
+
+def _resolve(previous: Keyframe, next: Keyframe, depth: DepthKind, visibility: Visibility) -> tuple[Any, Any]:
+    """What kind of depth there is, and how visibility is decided."""
+    check_choice("depth", depth, get_args(DepthKind))
+    check_choice("visibility", visibility, get_args(Visibility))
+    kind = depth if previous.depth is not None and next.depth is not None else "absent"
+    solid = previous.forward_flow.shape[2] == 3 and next.backward_flow.shape[2] == 3  # type: ignore[union-attr]
+    testable = kind == "metric" and solid
+    if visibility == "depth" and not testable:
+        raise ValueError("visibility: 'depth' needs metric depth in both keyframes and flows [H, W, 3]")
+    if visibility == "auto":
+        visibility = "depth" if testable else "round_trip"
+    return kind, visibility
+
+
+def interpolate_bidirectional(
+    previous: Keyframe,
+    next: Keyframe,
+    alpha: float | Float[ArrayLike, ""],
+    *,
+    target: Keyframe | None = None,
+    stencil_ids: Sequence[int] | None = None,
+    target_mode: TargetMode = "reproject",
+    offsets: Offsets | None = None,
+    starts: Sequence[Start] = ("default", "dual", "latest"),
+    reach: int = 1,
+    iterations: int = 3,
+    solver: Solver = "fixed_point",
+    flow_filter: FlowFilter = "nearest",
+    choice: Choice = "depth",
+    depth: DepthKind = "metric",
+    visibility: Visibility = "auto",
+    epsilon_error: float | Float[ArrayLike, ""] = 0.5,
+    epsilon_depth: float | Float[ArrayLike, ""] = 0.05,
+    epsilon_trip: float | Float[ArrayLike, ""] = 1.0,
+    filter: Filter = "bilinear",
+    shader: Shader | None = None,
+    shade: Shader | None = None,
+) -> Interpolation:
+    """The frame at t + alpha from the rendered frames at t and t + 1 and the 3D flows between them.
+
+    Each pixel searches for its point in both frames (`iterative_search`), from several starts, of which the best
+    solution counts; a search hits where its error is below a threshold and its place inside the frame. Then (5.2)
+    1. both hit, at similar depths: the point with the smaller error; 2. both hit, at different depths: the nearer
+    point; one hits: that point; 3. neither: the smaller error. The point's place in the other frame follows from the
+    flow (eq. 14 and 15); where it is visible there the two colours are blended by alpha, elsewhere it is taken alone.
+
+    With a `target`, the geometry of the frame to be made, and no `stencil_ids`, `interpolate_assisted` makes the frame.
+    With `stencil_ids` the target's pixels of those ids are drawn over the image-based frame through one depth buffer
+    (section 6): reprojected, or, where the I-frames leave them out, as the target's own colour has them.
+
+    Args:
+        previous: color `[H, W, C]`, any attributes, forward_flow, depth (may be absent). next: color, backward_flow,
+            depth.
+        alpha: in 0..1, traced; at 0 and 1 the frames are returned bit for bit.
+        target: depth, backward_flow to `previous`, forward_flow to `next` (see `camera_flow`), stencil. In the mode
+            "render" color, depth, stencil.
+        stencil_ids: which of the target's ids are drawn over; `None` = the whole frame is scene-assisted.
+        target_mode: "reproject" or "render", as above.
+        offsets: those of the frame made last between the same two, for the start "latest".
+        starts: "default" (the pixel itself), "dual" (by the other frame's flow), "latest" (by the offsets of the frame
+            made last; left out without them).
+        reach: of the neighbourhood that "latest" takes the nearest surface's offset from.
+        iterations, solver, flow_filter: of the searches. Depths are fetched as the flow is. Across a silhouette
+            "bilinear" finds points of a surface that is not there; "nearest" misses, as it should.
+        choice: among the starts' solutions: "depth", the nearest point of those that hit, else the smallest error; or
+            "error", always the smallest, as the paper has it.
+        depth: "metric", the distance along the view axis; or "ordinal": only comparable between the two frames, smaller
+            is nearer, unchanged by the flow, and epsilon_depth is a difference. Without depth nothing is compared, and
+            points that hit count as the same.
+        visibility: of a point in the other frame: "depth": its depth there agrees with the buffer; "round_trip": the
+            other frame's flow leads back; "inside": it is in the frame; "auto": by depth where that is metric and both
+            flows have three components, else by the round trip.
+        epsilon_error: in pixels, a search with a smaller error hits. epsilon_depth: relative to the smaller depth.
+        epsilon_trip: in pixels.
+        filter: of the colours, as in `backward_warp`.
+        shader: for pixels of the target visible in neither frame, see `interpolate_assisted`.
+        shade: called with the blended attributes `[H, W, C]`, gives the colour `[H, W, C']`: attributes may be
+            reprojected and lit anew (section 9). In the mode "render" the target's colour is drawn after it.
+
+    Returns:
+        An `Interpolation`.
+
+    Convention:
+        Each flow belongs to its own frame's grid and is added; pixels, x right, y down, integers are centres.
+
+    Edge cases:
+        A search that ends outside the frame misses, but where both miss its colour is the frame's edge. Flow that is
+        not finite misses. Depth that is not finite is as far as can be. Errors that differ by less than 0.001 pixels
+        are equal: the point of the frame nearer in time is taken then (at 1/2 the next), of two starts' the first, so
+        that rounding decides nothing. Of equal depths that of the next frame is taken. alpha 0 takes `previous`, 1
+        `next`, also where the motion is not finite.
+
+    Gradient:
+        With respect to colours, flows and alpha, through the places that the searches found (implicit function theorem,
+        see `iterative_search`) and the weights; which point is taken, and whether it is visible, is held fixed, so that
+        thresholds and depths get 0 (but depths in the result). None with respect to `offsets`.
+
+    Raises:
+        TypeError, ValueError: a field is absent that is needed, no floating-point array, or of another size; an option
+            that is not listed, or does not go with the others.
+
+    References:
+        Yang et al. 2011, sections 5, 6 and 9. Departures: one hit without the other is not printed; depths are compared
+        relatively; errors count as equal; searches that end outside miss, and "latest" leaves out offsets that missed;
+        round trips where there is no depth; choice="depth", flow_filter="nearest" by experiment.
+    """
+    how = {"starts": starts, "reach": reach, "iterations": iterations, "solver": solver, "flow_filter": flow_filter}
+    how |= {"choice": choice, "depth": depth, "visibility": visibility, "filter": filter}
+    check_choice("target_mode", target_mode, get_args(TargetMode))
+    check_scalar("alpha", alpha)
+    check_choice("filter", filter, get_args(Filter))
+    assisted = None
+    if target is not None and target_mode == "reproject":
+        options = {"epsilon_depth": epsilon_depth, "filter": filter, "shader": shader, "shade": shade}
+        assisted = interpolate_assisted(previous, next, target, alpha, **options)
+        if stencil_ids is None:
+            return assisted
+    size = _checked(previous, next)
+    if (target is None) != (stencil_ids is None):
+        raise ValueError("stencil_ids, target: expected both or neither here, got one")
+    thresholds = (epsilon_error, epsilon_depth, epsilon_trip)
+    made = _interpolate(
+        *_slim(previous, next), alpha, offsets, *thresholds, options=_options(previous, next, **how), shade=shade
+    )
+    if target is None or stencil_ids is None:
+        return made
+    stencil = check_present("target.stencil", target.stencil, needed_by="stencil_ids")
+    check_image("target.stencil", stencil, size=size, channels=1)
+    if assisted is None:
+        color = check_present("target.color", target.color, needed_by="target_mode='render'")
+        check_image("target.color", color, size=size, channels=made.color.shape[2])
+        rendered = jnp.full(size, CASES.index("rendered"), made.case.dtype)
+        over = check_present("target.depth", target.depth, needed_by="target_mode='render'")
+        check_image("target.depth", over, size=size, channels=1)
+        assisted = replace(made, color=color, depth=over, case=rendered)
+    epsilon = jnp.asarray(epsilon_depth).astype(made.weight.dtype)
+    return _drawn_ids(made, assisted, stencil, epsilon, stencil_ids=tuple(int(i) for i in stencil_ids))
+
+
+@partial(jax.jit, static_argnames=("stencil_ids",))
+def _drawn_ids(below, above, stencil, epsilon, *, stencil_ids):
+    ids = jnp.round(stencil[..., 0]).astype(jnp.int32)
+    covered = jnp.isin(ids, jnp.asarray(stencil_ids, jnp.int32))
+    return drawn_over(below, above, covered, epsilon)
+
+
+def _options(previous, next, *, starts, reach, iterations, solver, flow_filter, choice, depth, visibility, filter):
+    check_search(iterations=iterations, solver=solver, filter=flow_filter)
+    check_choice("choice", choice, get_args(Choice))
+    for start in starts:
+        check_choice("starts", start, get_args(Start))
+    if not isinstance(reach, int) or reach < 0:
+        raise ValueError(f"reach: expected an integer of at least 0, got {reach!r}")
+    kind, visibility = _resolve(previous, next, depth, visibility)
+    return _Options(tuple(starts), iterations, solver, flow_filter, filter, choice, kind, visibility, reach)
+
+
+def _slim(previous: Keyframe, next: Keyframe) -> tuple[Keyframe, Keyframe]:
+    """Only what image-based interpolation reads."""
+    first = Keyframe(color=previous.color, depth=previous.depth, forward_flow=previous.forward_flow)
+    return first, Keyframe(color=next.color, depth=next.depth, backward_flow=next.backward_flow)
+
+
+def interpolate_run(
+    previous: Keyframe,
+    next: Keyframe,
+    *,
+    factor: int,
+    targets: Keyframe | None = None,
+    **options: Any,
+) -> Float[Array, "n h w c"]:
+    """All `factor - 1` frames between two rendered ones, in order, one scan; each starts from the offsets of the last.
+
+    Args:
+        previous, next: as of `interpolate_bidirectional`.
+        factor: the frames are at alpha = k / factor, k = 1 .. factor - 1; at least 2.
+        targets: as `target`, each field `[factor - 1, ...]`.
+        options: of `interpolate_bidirectional`, but offsets.
+
+    Returns:
+        The colours `[factor - 1, H, W, C]`.
+
+    Raises:
+        TypeError, ValueError: as of `interpolate_bidirectional`; factor below 2, or offsets given.
+
+    References:
+        Yang et al. 2011, section 5.3, latest-frame initialization.
+    """
+    if not isinstance(factor, int) or factor < 2:
+        raise ValueError(f"factor: expected an integer of at least 2, got {factor!r}")
+    if "offsets" in options:
+        raise ValueError("offsets: expected none, a run carries its own")
+    size = _checked(previous, next)
+    flows = (previous.forward_flow, next.backward_flow)
+    wide = jnp.result_type(*(f for f in flows if f is not None), jnp.float32)
+    alphas = jnp.arange(1, factor, dtype=wide) / factor
+    if targets is not None and options.get("stencil_ids") is None:
+
+        def assist(_, given):
+            alpha, target = given
+            return None, interpolate_bidirectional(previous, next, alpha, target=target, **options).color
+
+        return jax.lax.scan(assist, None, (alphas, targets))[1]
+    known = previous.depth is not None and next.depth is not None
+    none = jnp.zeros((*size, 2), wide)
+    far = jnp.full((*size, 1), jnp.inf, wide) if known else None
+    start = Offsets(jnp.asarray(0.5, wide), none, none, far, far)
+
+    def step(offsets, given):
+        alpha, target = given
+        made = interpolate_bidirectional(previous, next, alpha, target=target, offsets=offsets, **options)
+        return made.offsets, made.color
+
+    return jax.lax.scan(step, start, (alphas, targets))[1]
