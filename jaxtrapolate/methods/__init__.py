@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from os import PathLike
 
-from jaxtrapolate.methods import warping
+from jaxtrapolate.methods import bidirectional, blending, grids, opticalflow, reprojection, warping
 from jaxtrapolate.methods.method import Method as Method
 from jaxtrapolate.methods.method import Stage as Stage
 
@@ -12,6 +12,17 @@ _METHODS: dict[str, Callable[[], Method]] = {
     "warp": warping.warp,
     "occlusion_warp": warping.occlusion_warp,
     "guided_warp": warping.guided,
+    "blend": blending.blend,
+    "reproject": reprojection.reprojection,
+    "half_motion": blending.half_motion,
+    "warp_3d": reprojection.warp_3d,
+    "grid_warp": grids.grid_warp,
+    "grid_extrapolate": grids.grid_extrapolate,
+    "softmax_splat": blending.softmax_splat,
+    "dis": opticalflow.dis,
+    "bidirectional_image": bidirectional.bidirectional_image,
+    "bidirectional": bidirectional.bidirectional,
+    "bidirectional_guided": bidirectional.bidirectional_guided,
 }
 
 

@@ -2,18 +2,22 @@
 
 The run, the benchmark, the plan and the reports all read that one list. A stage is a pure function of the method's
 state (its weights) and of the values so far, a dict; it returns the values that it adds. A method starts with "carry",
-"history", "target" and "future", and ends with "image".
+"history", "target" and "future", and ends with "image". A stage on the host (a library that is not JAX) is run between
+the compiled ones around it.
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import groupby
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxtrapolate.checks import ArrayLike
+from jaxtrapolate.checks import missing_package
 from jaxtrapolate.records import Frame, check_frame
 
 Values = Mapping[str, Any]
@@ -32,6 +36,8 @@ class Stage:
         optional: whether the method does without it: left out where a buffer is missing. Without a stage that is not
             optional the method cannot run.
         past: how many rendered frames it needs.
+        host: whether its function is no JAX code: it gets arrays and is never traced.
+        extra: the optional dependency that it needs, as in `pip install "jaxtrapolate[extra]"`.
     """
 
     name: str
@@ -39,10 +45,12 @@ class Stage:
     reads: tuple[str, ...] = ()
     optional: bool = False
     past: int = 1
+    host: bool = False
+    extra: str | None = None
 
 
-def buffer(frame: Frame, name: str) -> ArrayLike | None:
-    """A buffer of a frame by name: "color", "motion", or one of its `GBuffer`."""
+def buffer(frame: Frame, name: str) -> Any:
+    """What a frame has by name, or `None`: "color", "motion", "camera", "jitter", "time", or a buffer of its `GBuffer`."""
     if name in ("color", "motion", "camera", "jitter", "time"):
         return getattr(frame, name)
     return None if frame.gbuffer is None else getattr(frame.gbuffer, name)
@@ -51,6 +59,19 @@ def buffer(frame: Frame, name: str) -> ArrayLike | None:
 def rendered(history: Sequence[Frame]) -> list[int]:
     """The places in a history of the frames with colour, newest first."""
     return [i for i in range(len(history) - 1, -1, -1) if history[i].color is not None]
+
+
+def upcoming(future: Sequence[Frame]) -> list[int]:
+    """The places in a future of the frames with colour, the next first."""
+    return [i for i, frame in enumerate(future) if frame.color is not None]
+
+
+def _run(stages: Sequence[Stage], state: Any, values: Values) -> dict[str, Any]:
+    """What some stages add to the values, one after the other."""
+    added: dict[str, Any] = {}
+    for stage in stages:
+        added |= stage.function(state, {**values, **added})
+    return added
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -102,7 +123,10 @@ class Method:
     def _lacks(self, stage: Stage, history: Frames, target: Frame, future: Frames) -> list[str]:
         sources = [history[i] for i in rendered(history)][: self.past]
         lacks = [] if len(sources) >= stage.past else [f"{stage.past} rendered frames in history"]
-        roles = {"target": [target], "history": sources, "future": list(future[: self.future])}
+        if stage.extra is not None and (lacking := missing_package(stage.extra)):
+            lacks.append(lacking)
+        following = [future[i] for i in upcoming(future)][: self.future]
+        roles = {"target": [target], "history": sources, "future": following}
 
         def there(place: str) -> bool:
             role, name = place.split(".")
@@ -114,14 +138,44 @@ class Method:
     def function(
         self, state: Any, carry: Any, history: Frames, target: Frame, future: Frames = ()
     ) -> tuple[Any, Float[Array, "i j 3"]]:
-        """The pure function beneath: `(carry, image)`, for jit, grad, vmap, scan and sharding."""
+        """The pure function beneath: `(carry, image)`, for jit, grad, vmap, scan and sharding.
+
+        Raises:
+            TypeError: traced, in a method with a stage on the host: there is no such function of it.
+            ValueError: see `active`; frames whose sizes differ, or a history without colour.
+        """
         self._check(history, target, future)
         if target.color is not None and self.scale == 1:
-            return carry, target.color
+            return carry, jnp.asarray(target.color)
         values = {"carry": carry, "history": history, "target": target, "future": future}
         for stage in self.active(history, target, future):
+            if stage.host and any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state, values))):
+                raise TypeError(
+                    f"method {self.name!r}, stage {stage.name!r}: runs on the host, where nothing can be traced; "
+                    "call the method or its step outside of jit, grad and vmap"
+                )
             values |= stage.function(state, values)
         return values["carry"], values["image"]
+
+    def _by_turns(self, carry, history, target, future):
+        """As `function`, each row of stages between those on the host compiled as one."""
+        self._check(history, target, future)
+        if target.color is not None and self.scale == 1:
+            return carry, jnp.asarray(target.color)
+        values: dict[str, Any] = {"carry": carry, "history": history, "target": target, "future": future}
+        for host, group in groupby(self.active(history, target, future), key=lambda stage: stage.host):
+            row = tuple(group)
+            values |= _run(row, self.state, values) if host else self._rows(row)(self.state, values)
+        return values["carry"], values["image"]
+
+    def _rows(self, row: tuple[Stage, ...]) -> Callable[[Any, Values], dict[str, Any]]:
+        if row not in self._compiled_rows:
+            self._compiled_rows[row] = jax.jit(partial(_run, row))
+        return self._compiled_rows[row]
+
+    @cached_property
+    def _compiled_rows(self) -> dict[tuple[Stage, ...], Callable[[Any, Values], dict[str, Any]]]:
+        return {}
 
     def _check(self, history, target, future):
         size = None
@@ -140,8 +194,8 @@ class Method:
 
     @cached_property
     def jitted_stages(self) -> dict[str, Callable[[Any, Values], dict[str, Any]]]:
-        """Each stage on its own, compiled: for timing stage by stage."""
-        return {stage.name: jax.jit(stage.function) for stage in self.stages}
+        """Each stage on its own, compiled but for those on the host: for timing stage by stage."""
+        return {stage.name: stage.function if stage.host else jax.jit(stage.function) for stage in self.stages}
 
     def init(self, history: Frames, target: Frame) -> Any:
         """The carry before the first step; `()` for methods without memory."""
@@ -151,6 +205,8 @@ class Method:
         self, carry: Any, history: Frames, target: Frame, future: Frames = ()
     ) -> tuple[Any, Float[Array, "i j 3"]]:
         """One frame, compiled: `(carry, image)`; anew only where sizes or the buffers that are there change."""
+        if any(stage.host for stage in self.stages):
+            return self._by_turns(carry, history, target, future)
         return self._jitted(self.state, carry, history, target, future)
 
     def __call__(self, history: Frames, target: Frame, future: Frames = ()) -> Float[Array, "i j 3"]:

@@ -106,9 +106,9 @@ class Scene:
 
     Primitives are numbered shape by shape in the order of `primitives.KINDS`, as in `counts` in each, then the
     height field. rotation `[P, 3, 3]`, centre `[P, 3]`: pose in the body's space. size `[P, 3]`: see `primitives`.
-    material `[P(+1), M]`: see `MATERIAL`. counts: (aside, static, dynamic) primitives of each kind; those aside are static
-    and block no light. body: of each primitive.
-    bounce: whether glossy surfaces reflect; sun: whether there is one; water: whether a material has ripples.
+    material `[P(+1), M]`: see `MATERIAL`. counts: (aside, static, dynamic) primitives of each kind; those aside are
+    static and block no light. body: of each primitive. bounce: whether glossy surfaces reflect; sun: whether there is
+    one; water: whether a material has ripples.
     """
 
     bodies: Bodies

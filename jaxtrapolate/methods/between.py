@@ -1,0 +1,70 @@
+"""Stages that interpolating methods share.
+
+Values they pass on: "previous" and "next", the rendered frames around the target; "alpha", the target's time between
+them; "between", the motion from the next to the previous frame, on the next frame's grid; "forward" and "backward",
+the flows between the two, each on its own frame's grid.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxtrapolate.flows import complete_flows
+from jaxtrapolate.methods.method import Frames, Stage, Values, rendered, upcoming
+from jaxtrapolate.methods.stages import chain
+from jaxtrapolate.records import Frame, Keyframe
+
+
+def time_fraction(history: Frames, target: Frame, future: Frames) -> Float[Array, ""]:
+    """The target's time as a fraction of that between the rendered frames around it, 0 at the earlier one.
+
+    Where one of the three frames has no time, or both of those around the same, by their places in the sequence: 1/2
+    between two neighbours.
+    """
+    newest, following = rendered(history)[0], upcoming(future)[0]
+    counted = jnp.asarray((len(history) - newest) / (len(history) - newest + following + 1))
+    times = history[newest].time, target.time, future[following].time
+    if any(time is None for time in times):
+        return counted
+    before, at, after = (jnp.asarray(time) for time in times)
+    span = after - before
+    return jnp.where(span != 0, (at - before) / jnp.where(span != 0, span, 1), counted)
+
+
+def _pair(state, values: Values):
+    history, target, future = (values[name] for name in ("history", "target", "future"))
+    return {
+        "previous": history[rendered(history)[0]],
+        "next": future[upcoming(future)[0]],
+        "alpha": time_fraction(history, target, future),
+    }
+
+
+PAIR = Stage("pair", _pair, reads=("history.color", "future.color"))
+"""Finds the rendered frames around the target, and its time between them."""
+
+
+def _between(state, values: Values):
+    history, target, future = (values[name] for name in ("history", "target", "future"))
+    drawn = () if target.motion is None else (target,)  # future[0].motion leads to it, or else to the last of history
+    frames = (*history, *drawn, *future)
+    return {"between": chain(frames, len(history) + len(drawn) + upcoming(future)[0], rendered(history)[0])}
+
+
+BETWEEN = Stage("motion between", _between, reads=("future.motion",))
+"""Chains the motion from the next rendered frame to the previous one, through all that was drawn between them."""
+
+
+def depth_of(frame: Frame) -> Array | None:
+    """A frame's depth, if it has any."""
+    return None if frame.gbuffer is None or frame.gbuffer.depth is None else jnp.asarray(frame.gbuffer.depth)
+
+
+def _flows(state, values: Values):
+    previous, next = (Keyframe(depth=depth_of(values[name])) for name in ("previous", "next"))
+    # any depth will do: only its order is looked at
+    flows = complete_flows(previous, Keyframe(depth=next.depth, backward_flow=values["between"]), depth="ordinal")
+    return {"forward": flows.previous.forward_flow, "backward": values["between"]}
+
+
+FLOWS = Stage("flows", _flows, reads=("future.motion",))
+"""Both flows: the backward one is the chained motion, the forward one is made from it (`complete_flows`)."""

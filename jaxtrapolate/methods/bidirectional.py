@@ -1,0 +1,229 @@
+"""Bidirectional reprojection as methods (Yang et al. 2011): a frame between two rendered ones, from both.
+
+"bidirectional" uses what was drawn of the target (section 4): its motion leads to the frame before, the motion of the
+frame after, turned around, to that, and what is visible in both is blended. With nothing drawn, and always as
+"bidirectional_image", points are searched for in the two rendered frames alone (section 5).
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxtrapolate.assisted import DepthKind
+from jaxtrapolate.bidirectional import interpolate_bidirectional
+from jaxtrapolate.checks import check_present
+from jaxtrapolate.flows import complete_flows
+from jaxtrapolate.gather import backward_warp, in_frame, pixel_grid, sample
+from jaxtrapolate.guided import guided_warp
+from jaxtrapolate.methods.between import BETWEEN, PAIR, depth_of
+from jaxtrapolate.methods.method import Method, Stage, Values, rendered, upcoming
+from jaxtrapolate.methods.stages import SKY, chain, find_holes
+from jaxtrapolate.methods.warping import guides
+from jaxtrapolate.motion import camera_motion
+from jaxtrapolate.radiance import By, demodulate, modulate
+from jaxtrapolate.records import Frame, Keyframe
+
+_BLOCK = 8  # pixels, the side of the blocks over which differences are averaged
+_MARGIN = 2  # how much better the colour as it is must agree to make up half
+
+
+def depth_kind(*frames: Frame) -> DepthKind:
+    """ "metric" where cameras or positions say what the depth is measured in, else only its order counts."""
+    known = all(f.camera is not None or (f.gbuffer is not None and f.gbuffer.position is not None) for f in frames)
+    return "metric" if known else "ordinal"
+
+
+def _search(state, values: Values):
+    if "image" in values:  # made with the target's own buffers
+        return {}
+    previous, next, between = (values[name] for name in ("previous", "next", "between"))
+    kind = depth_kind(previous, next)
+    flows = complete_flows(
+        Keyframe(color=previous.color, depth=depth_of(previous)),
+        Keyframe(color=next.color, depth=depth_of(next), backward_flow=between),
+        depth=kind,
+    )
+    made = interpolate_bidirectional(flows.previous, flows.next, values["alpha"], depth=kind, visibility="round_trip")
+    return {"image": made.color}
+
+
+SEARCH = Stage("search", _search, reads=("future.motion",))
+"""Searches for each pixel's point in both frames, along their flows (5.1-5.3)."""
+
+
+def _reproject(state, values: Values):
+    history, target, future = (values[name] for name in ("history", "target", "future"))
+    frames, place = (*history, target, *future), len(history)
+    to_previous = chain(frames, place, rendered(history)[0])
+    from_next = chain(frames, place + 1 + upcoming(future)[0], place)
+    next = values["next"]
+    flows = complete_flows(
+        Keyframe(depth=depth_of(target)),
+        Keyframe(depth=depth_of(next), backward_flow=from_next),
+        depth=depth_kind(target, next),
+    )
+    to_next, known = flows.previous.forward_flow[..., :2], flows.forward_known
+    g = target.gbuffer
+    if target.camera is not None and next.camera is not None and g.position is not None and g.stencil is not None:
+        exact = camera_motion(g.position, target.camera, next.camera)
+        still = (g.stencil < 0.5) & jnp.all(jnp.isfinite(exact), -1, keepdims=True)
+        to_next, known = jnp.where(still, exact, to_next), known | still[..., 0]
+    seen_next = known[..., None] & ~find_holes(g, next.gbuffer, to_next)
+    previous = values["previous"]
+    seen_previous = ~find_holes(g, previous.gbuffer, to_previous)
+    return {"to_previous": to_previous, "to_next": to_next, "seen": (seen_previous, seen_next)}
+
+
+REPROJECT_BOTH = Stage("reproject to both", _reproject, reads=("target.motion", "future.motion", "target.depth"))
+"""The motion from the target to both rendered frames, and where its points are visible there.
+
+To the frame after it is that of the cameras where those are known and the surface is static, else the next frame's
+motion turned around (`complete_flows`). Visible is what no hole mask speaks against.
+"""
+
+
+def _optional(stage: Stage) -> Stage:
+    return dataclasses.replace(stage, optional=True)
+
+
+def _layers(frame: Frame, by: By | None) -> Array:
+    """What is reprojected `[H, W, 6]`: light, the colour over the reflectance, then the colour; without albedo that."""
+    color = check_present("color", frame.color, needed_by="bidirectional reprojection")
+    return color if by is None else jnp.concatenate([demodulate(color, frame.gbuffer, by=by), color], -1)
+
+
+def _demodulates(values: Values, by: By) -> By | None:
+    """`by`, where all three frames have the albedo that it takes."""
+    frames = (values["previous"], values["target"], values["next"])
+    return by if all(f.gbuffer is not None and f.gbuffer.albedo is not None for f in frames) else None
+
+
+def _weight(values: Values) -> Array:
+    """The next frame's weight (section 4): visible in both, the time; in one, that one alone; in neither, the likelier.
+
+    Closest-on-miss takes the nearer of the two. Here the target's depth is known: the frame whose depth there is
+    nearest to it is taken, one that the point is inside of first.
+    """
+    in_first, in_second = values["seen"]
+    at = (values["to_previous"], values["to_next"])
+    inside = [in_frame(motion)[..., None] for motion in at]
+    depth = depth_of(values["target"])
+    apart = [
+        jnp.abs(backward_warp(depth_of(values[n]), m) - depth) for n, m in zip(("previous", "next"), at, strict=True)
+    ]
+    likelier = jnp.where(inside[0] == inside[1], apart[1] < apart[0], inside[1])
+    one = jnp.where(in_first == in_second, likelier, in_second)
+    return jnp.where(in_first & in_second, values["alpha"], one.astype(values["alpha"].dtype))
+
+
+def fetch_stage(by: By) -> Stage:
+    """Fetches both frames along the motion, bilinearly."""
+
+    def function(state, values: Values):
+        if "seen" not in values:
+            return {}
+        by_ = _demodulates(values, by)
+        pairs = (("previous", "to_previous"), ("next", "to_next"))
+        fetched = tuple(backward_warp(_layers(values[name], by_), values[motion]) for name, motion in pairs)
+        return {"fetched": fetched, "weight": _weight(values), "both": values["seen"][0] & values["seen"][1]}
+
+    return Stage("fetch", function, reads=("history.depth", "future.depth"), optional=True)
+
+
+def guided_fetch_stage(by: By) -> Stage:
+    """Fetches both frames from the most similar pixels around where the motion leads, which need not be visible."""
+
+    def function(state, values: Values):
+        by_ = _demodulates(values, by)
+        fetched, inside = [], []
+        motions = (values["to_previous"], values["to_next"])
+        for name, motion, seen in zip(("previous", "next"), motions, values["seen"], strict=True):
+            frame = values[name]
+            pair = guides(values["target"].gbuffer, frame.gbuffer)
+            layers = guided_warp(_layers(frame, by_), motion, *pair)
+            color = backward_warp(check_present("color", frame.color, needed_by="guided fetch"), motion)
+            color = jnp.where(seen, color, layers[..., -3:])  # so that what stands still stays as it is
+            fetched.append(jnp.concatenate([layers[..., :-3], color], -1))
+            inside.append(in_frame(motion)[..., None])
+        one = inside[1].astype(values["alpha"].dtype)
+        weight = jnp.where(inside[0] == inside[1], values["alpha"], one)
+        return {"fetched": tuple(fetched), "weight": weight, "both": inside[0] & inside[1]}
+
+    roles, names = ("target", "history", "future"), ("albedo", "normal", "stencil")
+    reads = tuple("|".join(f"{role}.{name}" for name in names) for role in roles)
+    return Stage("guided fetch", function, reads=reads)
+
+
+def _blend(state, values: Values):
+    if "fetched" not in values:
+        return {}
+    first, second = (layers[..., -3:] for layers in values["fetched"])
+    return {"image": first * (1 - values["weight"]) + second * values["weight"]}
+
+
+BLEND = Stage("blend", _blend)
+"""Blends the colours of the two frames."""
+
+
+def _blocks(difference: Array) -> Array:
+    """Sums over blocks of pixels; as matrix products, see `hindsight`."""
+    height, width, _ = difference.shape
+
+    def member(size):
+        return (jnp.arange(size)[:, None] // _BLOCK == jnp.arange(-(-size // _BLOCK))[None]).astype(difference.dtype)
+
+    return (member(height).T @ (jnp.sum(difference, -1) @ member(width)))[..., None]
+
+
+def _apart(first: Array, second: Array, both: Array) -> Array:
+    """The squared difference of two images, tone mapped, by block; squared."""
+    tone = [
+        jnp.where(i > 0, jnp.sqrt(jnp.where(i > 0, i, 1) / (1 + jnp.where(i > 0, i, 1))), 0) for i in (first, second)
+    ]
+    return _blocks(jnp.where(both, jnp.square(tone[0] - tone[1]), 0)) ** 2
+
+
+def relight_stage(by: By) -> Stage:
+    """Blends light instead of colour: over each frame's reflectance, times the target's.
+
+    Where light is not reflectance times irradiance (emission, fog) that prints a texture which is not there. There the
+    two frames agree better as they are: blocks of 8 x 8 pixels take the colour as it is by how much better it agrees.
+    """
+
+    def function(state, values: Values):
+        if "fetched" not in values:
+            return {}
+        (first, second), weight, both = values["fetched"], values["weight"], values["both"]
+        light = [modulate(layers[..., :3], values["target"].gbuffer, by=by) for layers in (first, second)]
+        a, b = _apart(first[..., 3:], second[..., 3:], both) * _MARGIN**2, _apart(light[0], light[1], both)
+        share = jnp.where(a + b > 0, b / jnp.where(a + b > 0, a + b, 1), 1)
+        height, width = both.shape[:2]
+        x, y = pixel_grid(height, width, share.dtype)
+        x, y = (jnp.broadcast_to((v + 0.5) / _BLOCK - 0.5, (height, width)) for v in (x, y))
+        share = sample(share, x, y)
+        lit = light[0] * (1 - weight) + light[1] * weight
+        return {"image": lit * (1 - share) + values["image"] * share}
+
+    return Stage("relight", function, reads=("history.albedo", "target.albedo", "future.albedo"), optional=True)
+
+
+def bidirectional(*, by: By = "albedo+specular") -> Method:
+    """Both rendered frames around the target, by the target's own motion and buffers where those were drawn."""
+    stages = (PAIR, BETWEEN, _optional(REPROJECT_BOTH), fetch_stage(by), BLEND, relight_stage(by), SEARCH, SKY)
+    return Method("bidirectional", stages, kind="interpolation", past=1, future=1)
+
+
+def bidirectional_image() -> Method:
+    """Both rendered frames around the target, from their own buffers alone."""
+    return Method("bidirectional_image", (PAIR, BETWEEN, SEARCH), kind="interpolation", past=1, future=1)
+
+
+def bidirectional_guided(*, by: By = "albedo+specular") -> Method:
+    """As "bidirectional", each frame fetched by the guided warp (ExtraSS, section 4.2), and always both blended.
+
+    Ours. The guided warp finds like surfaces beside a hole, so that a frame in which the point is hidden still says
+    something of its light.
+    """
+    stages = (PAIR, BETWEEN, REPROJECT_BOTH, guided_fetch_stage(by), BLEND, relight_stage(by), SKY)
+    return Method("bidirectional_guided", stages, kind="interpolation", past=1, future=1)

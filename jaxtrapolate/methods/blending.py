@@ -1,0 +1,110 @@
+"""Baselines that mix the rendered frames around the target, their colours as they are: nothing is demodulated."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxtrapolate.assisted import blend as mix
+from jaxtrapolate.fill import fill_pyramid
+from jaxtrapolate.gather import backward_warp
+from jaxtrapolate.methods.between import BETWEEN, FLOWS, PAIR, depth_of
+from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.radiance import tonemap
+from jaxtrapolate.scatter import splat
+
+_BY_DEPTH = 5.0  # exponents at infinite depth; this and the next by mean dB on embedded scenes
+_BY_COLOR = 10.0  # exponents per difference of display values; the authors' release starts from 20
+
+
+def evenly(alpha: Array, image: Array) -> Float[Array, "h w 1"]:
+    """One weight for all pixels of an image."""
+    return jnp.broadcast_to(alpha, (*image.shape[:2], 1))
+
+
+def blend() -> Method:
+    """The rendered frames before and after, mixed by time: (1 - alpha) previous + alpha next.
+
+    References: Yang et al. 2011, section 9 ("naive linear blending").
+    """
+
+    def function(state, values: Values):
+        previous, next = values["previous"].color, values["next"].color
+        return {"image": mix(previous, next, evenly(values["alpha"], previous))}
+
+    return Method("blend", (PAIR, Stage("blend", function)), kind="interpolation", future=1)
+
+
+def half_motion() -> Method:
+    """The previous frame, fetched along a fraction alpha of the motion that the next frame has at the target's pixel.
+
+    References: Andreev 2010 (P[n - 1/2] = f(P[n - 1], -V[n] / 2) for velocities V), the direction that he prefers.
+    Departures: any time alpha, not only 1/2; his separate handling of characters is left out, for which the scene would
+    have to be rendered without them.
+    """
+
+    def function(state, values: Values):
+        return {"image": backward_warp(values["previous"].color, values["alpha"] * values["between"])}
+
+    return Method("half_motion", (PAIR, BETWEEN, Stage("fetch", function)), kind="interpolation", future=1)
+
+
+def _nearness(depth: Array) -> Float[Array, "h w 1"]:
+    """Exponents by depth of any unit: -100 depth / (depth + its mean over the frame); NaN counts as farthest."""
+    finite = jnp.isfinite(depth)
+    mean = jnp.sum(jnp.where(finite, jnp.abs(depth), 0)) / jnp.maximum(jnp.sum(finite), 1)
+    scale = jnp.where(mean > 0, mean, 1).astype(depth.dtype)
+    held = jnp.where(finite, depth, 0)
+    squashed = held / (jnp.abs(held) + scale)
+    return -_BY_DEPTH * jnp.where(finite, squashed, jnp.where(depth == -jnp.inf, -1, 1))
+
+
+def _likeness(own: Array, other: Array, flow: Array) -> Float[Array, "h w 1"]:
+    """Exponents by colour: -20 times the mean difference of display values from where the flow leads."""
+    apart = jnp.abs(tonemap(own) - tonemap(backward_warp(other, flow)))
+    apart = jnp.mean(apart, -1, keepdims=True)
+    return -_BY_COLOR * jnp.where(jnp.isfinite(apart), apart, 0)
+
+
+def softmax_splat() -> Method:
+    """Both frames splatted along their flows to the target, softmax where several pixels land, and mixed by time.
+
+    The exponents are -100 z / (z + mean z), z the depth, which needs no unit; where a frame has no depth, -20 times the
+    photometric error of its flow (on tone-mapped colours, mean over channels). Mixing weighs each side by time and by
+    its coverage (the sum of shares that landed, at most 1), so that what one side leaves open the other fills; what
+    both leave open is filled by `fill_pyramid`.
+
+    References: Niklaus and Liu 2020. Departures: no network makes the flows or mixes the warped frames: the flows are
+    the engine's, the forward one made from the backward one; depth instead of, or with, brightness constancy.
+    """
+
+    def importance(state, values: Values):
+        previous, next = values["previous"], values["next"]
+        first, second = depth_of(previous), depth_of(next)
+        return {
+            "exponents": (
+                _likeness(previous.color, next.color, values["forward"]) if first is None else _nearness(first),
+                _likeness(next.color, previous.color, values["backward"]) if second is None else _nearness(second),
+            )
+        }
+
+    def function(state, values: Values):
+        alpha = values["alpha"]
+        sides = []
+        for name, flow, passed, weights in (
+            ("previous", "forward", alpha, values["exponents"][0]),
+            ("next", "backward", 1 - alpha, values["exponents"][1]),
+        ):
+            color, motion = values[name].color, passed * values[flow]
+            warped = splat(color, motion, weights=weights.astype(color.dtype), mode="softmax")
+            landed = splat(jnp.ones_like(color[..., :1]), motion, mode="sum")
+            sides.append((warped, jnp.minimum(landed, 1)))
+        (first, in_first), (second, in_second) = sides
+        before, after = (1 - alpha) * in_first, alpha * in_second
+        covered = before + after > 0
+        weight = jnp.where(covered, after / jnp.where(covered, before + after, 1), evenly(alpha, first))
+        return {"mixed": mix(first, second, weight), "covered": covered[..., 0]}
+
+    def fill(state, values: Values):
+        return {"image": fill_pyramid(values["mixed"], values["covered"])}
+
+    stages = (PAIR, BETWEEN, FLOWS, Stage("exponents", importance), Stage("splat", function), Stage("fill", fill))
+    return Method("softmax_splat", stages, kind="interpolation", future=1)

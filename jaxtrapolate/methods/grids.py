@@ -1,0 +1,53 @@
+"""Baselines that warp a coarse grid laid over a rendered frame, its colour as it is: nothing is demodulated.
+
+The papers' warps go forward from one frame; see `jaxtrapolate.grid.grid_warp` for what departs from them.
+"""
+
+from jaxtrapolate.fill import fill_pyramid
+from jaxtrapolate.grid import grid_warp as warp_grid
+from jaxtrapolate.methods.between import BETWEEN, FLOWS, PAIR, depth_of
+from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.reprojection import CAMERA, LINEAR, NEWEST, ONWARD_NEEDS, carried_depth
+
+_CELL = 4  # pixels: stands for the refinement near silhouettes, which a uniform grid has not
+
+
+def _fill(state, values: Values):
+    return {"image": fill_pyramid(values["warped"], values["covered"])}
+
+
+_FILL = Stage("fill", _fill)
+
+
+def grid_warp() -> Method:
+    """Interpolation: the previous frame's grid, moved by a fraction alpha of its flow to the next rendered frame.
+
+    Its cells are 4 pixels wide; holes are filled by a pyramid.
+
+    References: Didyk et al. 2010, whose flow to the next frame is exact; ours is the chained backward motion turned
+    around (`complete_flows`). Schollmeyer et al. 2017, for the filling of holes in several scales.
+    """
+
+    def function(state, values: Values):
+        previous = values["previous"]
+        moved = values["forward"], depth_of(previous), values["alpha"]
+        warped, covered = warp_grid(previous.color, *moved, cell=_CELL)
+        return {"warped": warped, "covered": covered}
+
+    stages = (PAIR, BETWEEN, FLOWS, Stage("grid warp", function), _FILL)
+    return Method("grid_warp", stages, kind="interpolation", future=1)
+
+
+def grid_extrapolate() -> Method:
+    """Extrapolation: the newest frame's grid, moved by the motion that "warp_3d" pushes its pixels along.
+
+    References: as of `grid_warp`; Guo et al. 2021 (ExtraNet), Table 4, compare with it in this form.
+    """
+
+    def function(state, values: Values):
+        depth = None if depth_of(values["newest"]) is None else carried_depth(values)
+        warped, covered = warp_grid(values["newest"].color, values["onward"], depth, 1.0, cell=_CELL)
+        return {"warped": warped, "covered": covered}
+
+    stages = (NEWEST, LINEAR, CAMERA, Stage("grid warp", function, reads=ONWARD_NEEDS), _FILL)
+    return Method("grid_extrapolate", stages)

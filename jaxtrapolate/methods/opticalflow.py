@@ -1,0 +1,69 @@
+"""Interpolation by optical flow: what a display or a video player does, which knows nothing but the images.
+
+The flow is OpenCV's, computed on the host, so that this method has no pure function to trace; its other stages are
+compiled like those of any method.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtrapolate.assisted import blend as mix
+from jaxtrapolate.checks import ArrayLike
+from jaxtrapolate.gather import backward_warp
+from jaxtrapolate.methods.between import PAIR
+from jaxtrapolate.methods.blending import evenly
+from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.radiance import srgb_encode, tonemap
+
+_LEAST = 32  # pixels: smaller images are padded
+
+
+def gray(color: ArrayLike) -> np.ndarray:
+    """What a display shows, as grey levels uint8 `[H, W]`: in sRGB, or tone mapped where a channel is above 1.
+
+    Pixels that are not finite are black.
+    """
+    held = jnp.asarray(np.nan_to_num(np.asarray(color, np.float32), posinf=0, neginf=0))
+    shown = srgb_encode(jnp.clip(held, 0, 1)) if float(held.max()) <= 1 else tonemap(held)
+    return np.round(255 * (np.asarray(shown) @ np.array([0.299, 0.587, 0.114], np.float32))).astype(np.uint8)
+
+
+def dis_flow(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """DIS optical flow `[H, W, 2]` from a grey image to another (uint8 `[H, W]`), in pixels to add; preset medium.
+
+    References: Kroeger et al. 2016 (Fast optical flow using dense inverse search), as in OpenCV.
+    """
+    import cv2  # an extra
+
+    height, width = first.shape
+    padding = ((0, max(0, _LEAST - height)), (0, max(0, _LEAST - width)))
+    first, second = (np.ascontiguousarray(np.pad(image, padding, mode="edge")) for image in (first, second))
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, None)  # type: ignore[call-overload]
+    return np.asarray(flow[:height, :width], np.float32)
+
+
+def dis() -> Method:
+    """Both rendered frames fetched along their optical flow (DIS, preset medium) and mixed by time.
+
+    With F and B the flows from the previous to the next frame and back, the flow from the target to the previous frame
+    is taken for -alpha (1 - alpha) F + alpha^2 B at the target's own pixel, that to the next for (1 - alpha)^2 F -
+    alpha (1 - alpha) B.
+
+    References: Kroeger et al. 2016 for the flow, Jiang et al. 2018 (Super SloMo), equation 4, for that of the target.
+    Departures: no occlusion is reasoned about; colours are fetched and mixed as linear radiance, like everywhere here,
+    where a video player mixes display values.
+    """
+
+    def flow(state, values: Values):
+        first, second = gray(values["previous"].color), gray(values["next"].color)
+        return {"forward": jnp.asarray(dis_flow(first, second)), "backward": jnp.asarray(dis_flow(second, first))}
+
+    def function(state, values: Values):
+        alpha, forward, backward = values["alpha"], values["forward"], values["backward"]
+        rest = 1 - alpha
+        first = backward_warp(values["previous"].color, alpha * (alpha * backward - rest * forward))
+        second = backward_warp(values["next"].color, rest * (rest * forward - alpha * backward))
+        return {"image": mix(first, second, evenly(alpha, first))}
+
+    stages = (PAIR, Stage("optical flow", flow, host=True, extra="flow"), Stage("fetch", function))
+    return Method("dis", stages, kind="interpolation", future=1)

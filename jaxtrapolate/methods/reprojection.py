@@ -1,0 +1,174 @@
+"""Baselines that reproject the newest rendered frame, its colour as it is: nothing is demodulated.
+
+"onward" is a forward motion, on the newest rendered frame's grid, to the target.
+"""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxtrapolate.assisted import agree
+from jaxtrapolate.fill import fill_around
+from jaxtrapolate.flows import camera_flow
+from jaxtrapolate.gather import backward_warp, in_frame
+from jaxtrapolate.methods.between import depth_of
+from jaxtrapolate.methods.method import Frames, Method, Stage, Values, rendered
+from jaxtrapolate.methods.stages import REPROJECT, SKY
+from jaxtrapolate.records import Frame
+from jaxtrapolate.scatter import splat_nearest
+
+Shade = Callable[[Frame, Bool[Array, "h w"]], Float[Array, "h w 3"]]
+"""What a renderer does on a cache miss: colours `[H, W, 3]` for a target, looked at where the mask `[H, W]` is True."""
+
+_EPSILON = 0.05  # relative difference of depths of one point
+
+
+def reprojection(shade: Shade | None = None) -> Method:
+    """Reverse reprojection: the newest frame along the target's own motion, and a depth test that finds cache misses.
+
+    A pixel misses where its motion leads outside, or where the depth there is not its own: compared relatively (5 %),
+    after the change of depth that the cameras tell where positions and both cameras are there, else as it is.
+
+    Args:
+        shade: renders what missed, given the target (which has no colour: a held-back frame's is never seen) and the
+            mask. Without it misses keep what was fetched, so that the image is that of "warp".
+
+    References: Nehab et al. 2007; Yang et al. 2011, sections 2 and 9 ("single-direction reprojection"). Departure: the
+    depth test is relative; objects' own changes of depth are not known and count as none.
+    """
+
+    def change(state, values: Values):
+        target, newest = values["target"], values["newest"]
+        flow = camera_flow(target.gbuffer.position, target.camera, newest.camera)
+        change = flow[..., 2:]
+        static = jnp.isfinite(change)
+        if target.gbuffer.stencil is not None:
+            static &= target.gbuffer.stencil == 0
+        return {"change": jnp.where(static, change, 0)}
+
+    def test(state, values: Values):
+        motion, expected = values["motion"], values["target"].gbuffer.depth
+        expected = expected + values["change"] if "change" in values else expected
+        found = backward_warp(values["newest"].gbuffer.depth, motion, filter="nearest")
+        return {"missed": ~(in_frame(motion) & agree(found, expected, jnp.asarray(_EPSILON), "metric")[..., 0])}
+
+    def fetch(state, values: Values):
+        image = backward_warp(values["newest"].color, values["motion"])
+        if shade is not None:
+            missed = values["missed"] if "missed" in values else ~in_frame(values["motion"])
+            image = jnp.where(missed[..., None], shade(values["target"], missed).astype(image.dtype), image)
+        return {"image": image}
+
+    cameras = ("target.position", "target.camera", "history.camera")
+    depths = ("target.depth", "history.depth")
+    stages = (
+        REPROJECT,
+        Stage("change of depth", change, reads=cameras, optional=True),
+        Stage("depth test", test, reads=depths, optional=True),
+        Stage("fetch", fetch),
+        SKY,
+    )
+    return Method("reproject" if shade is None else "reproject_shade", stages)
+
+
+def steps_onward(history: Frames, target: Frame) -> Float[Array, ""]:
+    """How often the newest rendered frame's motion to the frame before it goes into the time until the target.
+
+    By the frames' times; a frame that is not handed over was one frame earlier. Without times, by the number of frames.
+    """
+    newest = rendered(history)[0]
+    counted = jnp.asarray(float(len(history) - newest))
+    now, at = history[newest].time, target.time
+    if now is None or at is None:
+        return counted
+    now, at = jnp.asarray(now), jnp.asarray(at)
+    before = history[newest - 1].time if newest > 0 else None
+    span = jnp.ones_like(now) if before is None else now - jnp.asarray(before)
+    return jnp.where(span != 0, (at - now) / jnp.where(span != 0, span, 1), counted)
+
+
+def _newest(state, values: Values):
+    history = values["history"]
+    return {"newest": history[rendered(history)[0]], "steps": steps_onward(history, values["target"])}
+
+
+NEWEST = Stage("newest", _newest, reads=("history.color",))
+"""Finds the newest rendered frame and how far ahead the target is."""
+
+
+def _linear(state, values: Values):
+    return {"onward": -values["steps"] * values["newest"].motion}
+
+
+LINEAR = Stage("linear motion", _linear, reads=("history.motion",), optional=True)
+"""The motion to the frame before, turned around and scaled by time: all goes on moving on the screen as it did."""
+
+
+def _camera(state, values: Values):
+    newest, target = values["newest"], values["target"]
+    buffers = newest.gbuffer
+    flow = camera_flow(buffers.position, newest.camera, target.camera)
+    exact, onward = flow[..., :2], values.get("onward")
+    if onward is not None:
+        still = jnp.zeros((*exact.shape[:2], 1), bool) if buffers.stencil is None else buffers.stencil == 0
+        still = still if buffers.sky is None else still & (buffers.sky < 0.5)
+        exact = jnp.where(still, exact, onward)
+        flow = jnp.where(still, flow, 0)
+    return {"onward": exact, "deeper": flow[..., 2:]}
+
+
+CAMERA = Stage("camera motion", _camera, reads=("history.position", "history.camera", "target.camera"), optional=True)
+"""The exact motion of what the stencil calls static, from both cameras; all of it where there are no motion vectors."""
+
+ONWARD_NEEDS = tuple(f"history.motion|{name}" for name in ("history.position", "history.camera", "target.camera"))
+"""What "onward" takes: motion vectors, or positions and both cameras."""
+
+
+def carried_depth(values: Values) -> Array:
+    """The newest frame's depth `[H, W, 1]` as it is in the target, where that is known; zeros without depth."""
+    depth = depth_of(values["newest"])
+    if depth is None:
+        return jnp.zeros_like(values["onward"][..., :1])
+    deeper = values.get("deeper")
+    return depth if deeper is None else depth + jnp.where(jnp.isfinite(deeper), deeper, 0)
+
+
+def warp_3d() -> Method:
+    """The newest frame's pixels pushed along their own motion to the target, the nearest in depth winning.
+
+    No buffer of the target is looked at, but its camera. The forward motion of what is static is exact where cameras,
+    positions and a stencil are there; else, and of what moves, it is the motion to the frame before, carried on
+    linearly. A pixel covers the four around its landing place; each of these fetches its colour bilinearly along the
+    motion that landed on it. Where the fetch would meet another surface (depths differ by more than 5 %) the pixel is
+    beside a silhouette: there counts what lands within half a pixel, if anything does, and else the colour that landed.
+    A hole takes the colour of the farthest of the next covered pixels left, right, above and below (`fill_around`).
+
+    References: Mark et al. 1997, sections 2 and 3. Departures: one reference frame, the past one, so that nothing is
+    known behind a silhouette; splats of four pixels with bilinear fetches for their mesh of triangles; objects move.
+    """
+
+    def push(state, values: Values):
+        color, onward, depth = values["newest"].color, values["onward"], carried_depth(values)
+        own = depth_of(values["newest"])
+        own = depth if own is None else own
+        layers = jnp.concatenate([-onward, depth, own, color], -1)
+
+        def land(footprint):
+            """What landed, its fetched colour, its depth, where it is covered, and whether the fetch meets itself."""
+            pushed, covered = splat_nearest(layers, onward, depth, footprint=footprint)
+            back, expected, whole = pushed[..., :2], pushed[..., 3:4], pushed[..., 4:]
+            found = backward_warp(own, back, filter="nearest")
+            same = agree(found, expected, jnp.asarray(_EPSILON), "metric")
+            return jnp.where(same, backward_warp(color, back), whole), pushed[..., 2:3], covered, same
+
+        (wide, wide_z, covered, same), (near, near_z, centred, _) = land(4), land(1)
+        beside = centred[..., None] & ~same  # beyond a silhouette, and something lands there more exactly
+        return {"warped": jnp.where(beside, near, wide), "z": jnp.where(beside, near_z, wide_z), "covered": covered}
+
+    def fill(state, values: Values):
+        known = None if depth_of(values["newest"]) is None else values["z"]
+        return {"image": fill_around(values["warped"], values["covered"], depth=known)}
+
+    stages = (NEWEST, LINEAR, CAMERA, Stage("push", push, reads=ONWARD_NEEDS), Stage("fill", fill))
+    return Method("warp_3d", stages)
