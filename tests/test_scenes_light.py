@@ -180,6 +180,7 @@ def columns():
     )
 
 
+@pytest.mark.slow
 def test_jitter_moves_the_samples_and_not_the_motion(columns):
     jitter = np.array([0.31, -0.22], np.float32)
     frame = jax.tree.map(np.asarray, render(columns, 4.0, size=SIZE, jitter=jnp.asarray(jitter)))

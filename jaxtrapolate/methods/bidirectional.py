@@ -197,7 +197,7 @@ def relight_stage(by: By) -> Stage:
         (first, second), weight, both = values["fetched"], values["weight"], values["both"]
         light = [modulate(layers[..., :3], values["target"].gbuffer, by=by) for layers in (first, second)]
         a, b = _apart(first[..., 3:], second[..., 3:], both) * _MARGIN**2, _apart(light[0], light[1], both)
-        share = jnp.where(a + b > 0, b / jnp.where(a + b > 0, a + b, 1), 1)
+        share = jnp.where(a + b > 0, b / jnp.where(a + b > 0, a + b, 1), 0)
         height, width = both.shape[:2]
         x, y = pixel_grid(height, width, share.dtype)
         x, y = (jnp.broadcast_to((v + 0.5) / _BLOCK - 0.5, (height, width)) for v in (x, y))
