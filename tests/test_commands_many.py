@@ -358,3 +358,11 @@ def test_videos_that_cannot_be(capsys, scenes, tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert 'pip install "jaxtrapolate[video]"' in refuses(capsys, *one, "--video", "a.mp4")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_speed_of_scenes(tmp_path, capsys):
+    main(["scenes", "forest", "--speed", "--size", "33x17", "--json", str(tmp_path / "speed.json")])
+    (row,) = json.loads((tmp_path / "speed.json").read_text())["speed"].values()
+    assert row["fps"] == pytest.approx(1e3 / row["frame_ms"])
+    assert f"| forest | {row['compile_s']:.0f} | {row['frame_ms']:.1f} | {row['fps']:.1f} |" in capsys.readouterr().out

@@ -2,6 +2,8 @@
 
 import argparse
 import json
+import statistics as figures
+import time
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +20,16 @@ def add_parser(subparsers: Any) -> None:
         "scenes",
         help="the embedded scenes, and how hard they are",
         description="Lists the embedded scenes; with --statistics it measures how hard the test seeds of them are: "
-        "motion, disocclusion, moving shadow and gloss between rendered frames, as a Markdown table.",
+        "motion, disocclusion, moving shadow and gloss between rendered frames, as a Markdown table; with --speed, how "
+        "fast they are rendered here.",
     )
     parser.add_argument("scene", nargs="*", metavar="SCENE", help="names of embedded scenes (all)")
     parser.add_argument("--statistics", action="store_true", help="measure motion, disocclusion, shadow, gloss")
-    parser.add_argument("--size", default="1024x768", metavar="WxH", help="width and height in pixels (1024x768)")
-    parser.add_argument("--json", metavar="FILE", help="write the statistics of each seed to this file as well")
+    parser.add_argument("--speed", action="store_true", help="measure seconds to compile and frames a second")
+    parser.add_argument(
+        "--size", metavar="WxH", help="width and height in pixels (1024x768 for --statistics, 320x180 for --speed)"
+    )
+    parser.add_argument("--json", metavar="FILE", help="write the figures to this file as well")
     parser.set_defaults(run=run)
 
 
@@ -38,18 +44,46 @@ def run(options: argparse.Namespace) -> None:
     if wrong:
         raise InputError(f"no scene {', '.join(wrong)}; the embedded ones are {', '.join(scene_names())}")
     out = Console()
-    if not options.statistics:
+    if not (options.statistics or options.speed):
         for name in names:
             first = (SCENES[name].__doc__ or "").splitlines()[0]
             out.print(f"[bold]{name}[/bold]: {first}", soft_wrap=True, highlight=False)
         return
-    size = parse_size(options.size)
-    rows: dict[str, list] = {name: [] for name in names}
+    size = parse_size(options.size or ("1024x768" if options.statistics else "320x180"))
+    found: dict[str, Any] = {"size": list(size)}
     with progress(Console(stderr=True)) as bar:
-        for name, seed in bar.track([(n, s) for n in names for s in TEST_SEEDS], description="statistics"):
-            rows[name].append(statistics(scene(name, seed), size=size))
-    out.print(table({name: mean(values) for name, values in rows.items()}), soft_wrap=True, highlight=False)
+        if options.statistics:
+            rows: dict[str, list] = {name: [] for name in names}
+            for name, seed in bar.track([(n, s) for n in names for s in TEST_SEEDS], description="statistics"):
+                rows[name].append(statistics(scene(name, seed), size=size))
+            out.print(table({name: mean(values) for name, values in rows.items()}), soft_wrap=True, highlight=False)
+            found["scenes"] = {n: dict(zip(map(str, TEST_SEEDS), map(vars, v), strict=True)) for n, v in rows.items()}
+        if options.speed:
+            speeds = {name: _speed(name, size) for name in bar.track(names, description="speed")}
+            out.print("| scene | compile, s | frame, ms | frames a second |\n|---|---|---|---|", highlight=False)
+            for name, row in speeds.items():
+                line = f"| {name} | {row['compile_s']:.0f} | {row['frame_ms']:.1f} | {row['fps']:.1f} |"
+                out.print(line, highlight=False)
+            found["speed"] = speeds
     if options.json:
-        found = {n: dict(zip(map(str, TEST_SEEDS), map(vars, v), strict=True)) for n, v in rows.items()}
         with atomic_path(Path(options.json)) as temporary:
-            temporary.write_text(json.dumps({"size": list(size), "scenes": found}, indent=1))
+            temporary.write_text(json.dumps(found, indent=1))
+
+
+def _speed(name: str, size: tuple[int, int], frames: int = 25) -> dict[str, float]:
+    """Seconds to compile a scene, and the median milliseconds of a frame with all its buffers."""
+    import jax
+
+    from jaxtrapolate.scenes import render, scene
+
+    world = scene(name)
+    begin = time.perf_counter()
+    jax.block_until_ready(render(world, 0.0, size=size))
+    compiled = time.perf_counter() - begin
+    took = []
+    for k in range(1, frames + 1):
+        begin = time.perf_counter()
+        jax.block_until_ready(render(world, float(k), size=size))
+        took.append(time.perf_counter() - begin)
+    median = figures.median(took)
+    return {"compile_s": compiled, "frame_ms": 1e3 * median, "fps": 1 / median}

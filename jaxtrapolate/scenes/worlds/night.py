@@ -18,7 +18,7 @@ def interior(rng: np.random.Generator) -> Scene:
         noise=0.2,
         noise_frequency=2,
         roughness=0.24,
-        roughness_b=0.4,
+        roughness_b=0.7,
     )
     b.add("plane", (0, 0, 0), (1, 1, 1), floor)
     plaster = common.shifted(rng, (0.5, 0.42, 0.34))
@@ -84,13 +84,14 @@ def street(rng: np.random.Generator) -> Scene:
     asphalt = material(
         common.shifted(rng, (0.07, 0.07, 0.075)),
         color_b=(0.16, 0.15, 0.14),
-        frequency=(0.33, 0, 0),
-        duty=0.08,
+        frequency=(0.33, 0.21, 0),
+        duty=0.6,
+        tiled=1,
         noise=0.5,
         noise_frequency=2.0,
         offset=common.offset(rng) * (1, 1, 0),
-        roughness=0.22,
-        roughness_b=0.5,
+        roughness=0.12,
+        roughness_b=0.75,
     )
     b.add("plane", (0, 0, 0), (1, 1, 1), asphalt)
     start = rng.uniform(0, 2 * np.pi)
@@ -109,8 +110,8 @@ def street(rng: np.random.Generator) -> Scene:
             offset=common.offset(rng),
             noise=0.3,
             noise_frequency=2,
-            roughness=0.15,
-            roughness_b=0.7,
+            roughness=0.6,
+            roughness_b=0.8,
             emission=lit * 0.5,
         )
         b.add("box", (r * np.cos(a), r * np.sin(a), size[2]), size, house, rotation=yaw(a), blocks=False)
