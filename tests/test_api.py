@@ -30,6 +30,7 @@ def test_the_contract_names_are_there():
     expected = {
         *("Camera", "GBuffer", "Frame", "Keyframe", "backward_warp", "in_frame", "chain_motion", "convert_motion"),
         *("camera_motion", "splat_nearest", "splat", "occlusion_motion", "guided_warp", "__version__"),
+        *("iterative_search", "interpolate_bidirectional", "interpolate_run", "complete_flows", "camera_flow"),
     }
     assert expected <= set(vars(jx))
 
@@ -81,6 +82,7 @@ large, larger = random(12, 13, 2, seed=5), random(12, 13, 2, seed=6)
 normal, second = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (color, other))
 views = [look(a).astype(np.float32) for a in (0.1, -0.1)]
 far = (random(H, W, 3, seed=7, low=-1) - np.float32([0, 0, 5])).astype(np.float32)
+smooth = np.float32([0.4, -0.3, 0.01]) + np.float32(0.1) * random(H, W, 3, seed=9)
 CONVENTION = {"sign": "current_minus_previous", "units": "uv", "y_axis": "up"}
 
 OPERATIONS = {
@@ -99,6 +101,26 @@ OPERATIONS = {
     "guided_warp": (
         lambda i, m, t, s, a, b: jx.guided_warp(i, m, t, s, strides=(1,), keep=2, sigma_guide=a, sigma_space=b),
         *(image, motion, color, other, np.float32(0.5), np.float32(1.5)),
+    ),
+    "camera_flow": (lambda p, a, b: jx.camera_flow(p, camera(a), camera(b)), far, *views),
+    "iterative_search": (lambda f, a: jx.iterative_search(f, a).position, smooth, np.float32(0.4)),
+    "interpolate_bidirectional": (
+        lambda a, b, f, g, d: (
+            jx.interpolate_bidirectional(
+                jx.Keyframe(color=a, depth=d, forward_flow=f), jx.Keyframe(color=b, depth=d, backward_flow=g), 0.4
+            ).color
+        ),
+        *(color, other, smooth, -smooth, depth + np.float32(1)),
+    ),
+    "interpolate_assisted": (
+        lambda a, b, d, t: (
+            jx.interpolate_bidirectional(
+                *(jx.Keyframe(color=c, depth=d) for c in (a, b)),
+                0.4,
+                target=jx.Keyframe(depth=d, forward_flow=t, backward_flow=-t),
+            ).color
+        ),
+        *(color, other, depth + np.float32(1), smooth),
     ),
     "hole_masks": (
         lambda n, p, q, m, s: holes.hole_masks(gbuffer(p, n, p), gbuffer(p, second, q), m, softness=s).any,
@@ -123,6 +145,9 @@ OPERATIONS = {
 }
 
 
+BETWEEN = ("interpolate_bidirectional", "interpolate_assisted")
+
+
 def cases(*slow):
     return [pytest.param(name, marks=pytest.mark.slow) if name in slow else name for name in OPERATIONS]
 
@@ -132,7 +157,9 @@ def batch(arrays):
     return [jnp.stack([jnp.asarray(a), jnp.asarray(a) * 0.95]) for a in arrays]
 
 
-@pytest.mark.parametrize("name", cases("backward_warp-bicubic", "guided_warp", "splat-linear", "splat-softmax"))
+@pytest.mark.parametrize(
+    "name", cases("backward_warp-bicubic", "guided_warp", "splat-linear", "splat-softmax", *BETWEEN)
+)
 def test_eager_is_jit_is_vmap(name):
     function, *arrays = OPERATIONS[name]
     pair = batch(arrays)
@@ -158,7 +185,7 @@ def derivatives(function, *arrays):
     return forward, sum(jnp.vdot(a, g) for a, g in zip(along, found, strict=True)), found, curved
 
 
-HEAVY = ["backward_warp-bicubic", "guided_warp", "hole_masks", "ssim", "splat", "splat-linear"]
+HEAVY = ["backward_warp-bicubic", "guided_warp", "hole_masks", "ssim", "splat", "splat-linear", *BETWEEN]
 
 
 @pytest.mark.parametrize("name", cases(*HEAVY))
@@ -175,7 +202,7 @@ def test_forward_and_reverse_derivatives_agree(name):
             np.testing.assert_allclose(mapped[0], one, rtol=1e-3, atol=1e-5)
 
 
-STRICT = sorted(set(OPERATIONS) - {"convert_motion", "camera_motion", "guided_warp"})
+STRICT = sorted(set(OPERATIONS) - {"convert_motion", "camera_motion", "camera_flow", "guided_warp"})
 
 
 @pytest.mark.parametrize("name", STRICT)
