@@ -137,6 +137,8 @@ OPERATIONS = {
     "log_decode": (radiance.log_decode, color),
     "tonemap": (lambda c, g: radiance.tonemap(c, gamma=g), color, np.float32(2.2)),
     "tonemap_inverse": (lambda c, g: radiance.tonemap_inverse(c, gamma=g), color * np.float32(0.8), np.float32(2.2)),
+    "compress": (radiance.compress, color),
+    "expand": (radiance.expand, color * np.float32(0.8)),
     "srgb_encode": (radiance.srgb_encode, color),
     "srgb_decode": (radiance.srgb_decode, color),
     "mse": (metrics.mse, large, larger),

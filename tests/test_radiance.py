@@ -10,6 +10,7 @@ from oracles import random
 
 import jaxtrapolate as jx
 from jaxtrapolate import radiance
+from jaxtrapolate.radiance import compress, expand
 from jaxtrapolate.records import replace
 
 SIZE = (5, 7)
@@ -164,3 +165,17 @@ def test_errors(unchecked):
             function(color.astype(int), g)
         with pytest.raises(TypeError, match="gbuffer: expected a GBuffer"):
             function(color, None)
+
+
+def test_compress_and_expand():
+    x = np.concatenate([[0.0], np.logspace(-8, 4, 200)])
+    packed = compress(jnp.asarray(x, jnp.float32))
+    np.testing.assert_allclose(packed, np.sqrt(x / (1 + x)), rtol=3e-7, atol=0)
+    back = np.asarray(expand(packed), np.float64)
+    assert np.all(np.abs(back - x) <= 3e-7 * x * (1 + x))
+    odd = compress(jnp.array([-1.0, np.nan, np.inf, 0.0], jnp.float32))
+    np.testing.assert_array_equal(odd, [0, 0, 1, 0])
+    largest = np.finfo(np.float32).max
+    np.testing.assert_array_equal(expand(jnp.array([-1.0, 0.0, 1.0, 2.0], jnp.float32)), [0, 0, largest, largest])
+    for function, places in ((compress, [-1.0, 0.0, 1e-8, 1.0, 65504.0, np.inf]), (expand, [-1.0, 0.0, 0.5, 1.0, 2.0])):
+        assert np.isfinite(jax.grad(lambda v, f=function: f(v).sum())(jnp.array(places, jnp.float32))).all()

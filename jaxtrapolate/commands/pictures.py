@@ -25,7 +25,8 @@ def eight_bit(image: Any) -> np.ndarray:
 def buffer_picture(name: str, value: Any, sky: Any = None) -> np.ndarray:
     """A buffer as a picture: normals from -1..1, what has no range of its own between its 1st and 99th percentile.
 
-    Where there is a sky its far values do not count for the range.
+    Where there is a sky its far values do not count for the range. Depth is shown as log(1 + depth / its median): what
+    is near is told apart although most of a scene is far.
     """
     value = np.asarray(value, np.float32)
     if name == "normal":
@@ -34,6 +35,9 @@ def buffer_picture(name: str, value: Any, sky: Any = None) -> np.ndarray:
         counts = np.isfinite(value)
         if sky is not None and name != "stencil":
             counts = counts & (np.asarray(sky) < 0.5)
+        if name == "depth" and counts.any():
+            middle = max(float(np.median(value[counts])), 1e-6)
+            value = np.log1p(np.maximum(value, 0) / middle)
         finite = np.where(counts, value, np.nan)
         low, high = np.nanpercentile(finite, (1, 99), axis=(0, 1)) if counts.any() else (0.0, 1.0)
         high = np.maximum(high, value.max(axis=(0, 1))) if name == "stencil" else high

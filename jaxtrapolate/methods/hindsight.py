@@ -17,7 +17,7 @@ from jaxtrapolate.checks import check_present
 from jaxtrapolate.gather import backward_warp, landing, sample
 from jaxtrapolate.methods.method import Stage, Values, rendered
 from jaxtrapolate.methods.stages import chain
-from jaxtrapolate.radiance import By, demodulate, modulate
+from jaxtrapolate.radiance import By, compress, demodulate, modulate
 from jaxtrapolate.records import Frame
 
 _BLOCK = 8  # pixels, the side of the blocks over which errors are averaged
@@ -37,12 +37,6 @@ def _blocks(image: Float[Array, "h w 1"]) -> Float[Array, "i j 1"]:
     return (member(height).T @ (image[..., 0] @ member(width)))[..., None]
 
 
-def _display(color):
-    """A tone curve for comparing errors: sqrt(x / (1 + x)), which is near `tonemap` and cheaper."""
-    positive = jnp.where(color > 0, color, 1)
-    return jnp.where(color > 0, jnp.sqrt(positive / (1 + positive)), 0)
-
-
 @partial(jax.jit, static_argnames=("by",))
 def plain_share(newest: Frame, previous: Frame, motion: Float[Array, "h w 2"], *, by: By) -> Float[Array, "i j 1"]:
     """How much of a prediction should come from the colour as it is, 0..1, for each block of 8 x 8 pixels of `newest`.
@@ -52,13 +46,13 @@ def plain_share(newest: Frame, previous: Frame, motion: Float[Array, "h w 2"], *
     that what stands still stays as it is. The margin of 2 is for what the methods add to demodulation; on embedded
     scenes it gives the guided warp 0.4-0.5 dB, and costs the occlusion warp 0.2-0.4 dB.
     """
-    truth = _display(check_present("newest.color", newest.color, needed_by="plain_share"))
+    truth = compress(check_present("newest.color", newest.color, needed_by="plain_share"))
     color = check_present("previous.color", previous.color, needed_by="plain_share")
     plain = backward_warp(color, motion)
     demodulated = backward_warp(demodulate(color, previous.gbuffer, by=by), motion)
 
     def error(image):
-        difference = jnp.square(_display(image) - truth)
+        difference = jnp.square(compress(image) - truth)
         return _blocks(difference[..., :1] + difference[..., 1:2] + difference[..., 2:]) ** 2
 
     a, b = error(plain) * _MARGIN**2, error(modulate(demodulated, newest.gbuffer, by=by))
