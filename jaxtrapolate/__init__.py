@@ -6,7 +6,6 @@ from jaxtrapolate.assisted import Offsets as Offsets
 from jaxtrapolate.assisted import interpolate_assisted as interpolate_assisted
 from jaxtrapolate.assisted import overlay as overlay
 from jaxtrapolate.bidirectional import interpolate_bidirectional as interpolate_bidirectional
-from jaxtrapolate.bidirectional import interpolate_run as interpolate_run
 from jaxtrapolate.causes import CAUSES as CAUSES
 from jaxtrapolate.causes import cause_map as cause_map
 from jaxtrapolate.causes import disoccluded as disoccluded
@@ -44,6 +43,8 @@ from jaxtrapolate.records import Frame as Frame
 from jaxtrapolate.records import GBuffer as GBuffer
 from jaxtrapolate.records import Keyframe as Keyframe
 from jaxtrapolate.records import replace as replace
+from jaxtrapolate.runs import interpolate_run as interpolate_run
+from jaxtrapolate.runs import motion_blur as motion_blur
 from jaxtrapolate.scatter import splat as splat
 from jaxtrapolate.scatter import splat_nearest as splat_nearest
 from jaxtrapolate.search import Correspondence as Correspondence

@@ -338,7 +338,7 @@ def interpolate_bidirectional(
         raise ValueError("stencil_ids, target: expected both or neither here, got one")
     thresholds = (epsilon_error, epsilon_depth, epsilon_trip)
     made = _interpolate(
-        *_slim(previous, next), alpha, offsets, *thresholds, options=_options(previous, next, **how), shade=shade
+        *slim(previous, next), alpha, offsets, *thresholds, options=_options(previous, next, **how), shade=shade
     )
     if target is None or stencil_ids is None:
         return made
@@ -373,60 +373,7 @@ def _options(previous, next, *, starts, reach, iterations, solver, flow_filter, 
     return _Options(tuple(starts), iterations, solver, flow_filter, filter, choice, kind, visibility, reach)
 
 
-def _slim(previous: Keyframe, next: Keyframe) -> tuple[Keyframe, Keyframe]:
-    """Only what image-based interpolation reads."""
+def slim(previous: Keyframe, next: Keyframe) -> tuple[Keyframe, Keyframe]:
+    """Only what interpolation reads of the frames around."""
     first = Keyframe(color=previous.color, depth=previous.depth, forward_flow=previous.forward_flow)
     return first, Keyframe(color=next.color, depth=next.depth, backward_flow=next.backward_flow)
-
-
-def interpolate_run(
-    previous: Keyframe,
-    next: Keyframe,
-    *,
-    factor: int,
-    targets: Keyframe | None = None,
-    **options: Any,
-) -> Float[Array, "n h w c"]:
-    """All `factor - 1` frames between two rendered ones, in order, one scan; each starts from the offsets of the last.
-
-    Args:
-        previous, next: as of `interpolate_bidirectional`.
-        factor: the frames are at alpha = k / factor, k = 1 .. factor - 1; at least 2.
-        targets: as `target`, each field `[factor - 1, ...]`.
-        options: of `interpolate_bidirectional`, but offsets.
-
-    Returns:
-        The colours `[factor - 1, H, W, C]`.
-
-    Raises:
-        TypeError, ValueError: as of `interpolate_bidirectional`; factor below 2, or offsets given.
-
-    References:
-        Yang et al. 2011, section 5.3, latest-frame initialization.
-    """
-    if not isinstance(factor, int) or factor < 2:
-        raise ValueError(f"factor: expected an integer of at least 2, got {factor!r}")
-    if "offsets" in options:
-        raise ValueError("offsets: expected none, a run carries its own")
-    size = _checked(previous, next)
-    flows = (previous.forward_flow, next.backward_flow)
-    wide = jnp.result_type(*(f for f in flows if f is not None), jnp.float32)
-    alphas = jnp.arange(1, factor, dtype=wide) / factor
-    if targets is not None and options.get("stencil_ids") is None:
-
-        def assist(_, given):
-            alpha, target = given
-            return None, interpolate_bidirectional(previous, next, alpha, target=target, **options).color
-
-        return jax.lax.scan(assist, None, (alphas, targets))[1]
-    known = previous.depth is not None and next.depth is not None
-    none = jnp.zeros((*size, 2), wide)
-    far = jnp.full((*size, 1), jnp.inf, wide) if known else None
-    start = Offsets(jnp.asarray(0.5, wide), none, none, far, far)
-
-    def step(offsets, given):
-        alpha, target = given
-        made = interpolate_bidirectional(previous, next, alpha, target=target, offsets=offsets, **options)
-        return made.offsets, made.color
-
-    return jax.lax.scan(step, start, (alphas, targets))[1]
