@@ -21,7 +21,7 @@ from jaxtrapolate.methods.method import Method
 from jaxtrapolate.metrics import Metric, psnr
 from jaxtrapolate.metrics import load as load_metric
 from jaxtrapolate.radiance import srgb_encode, tonemap
-from jaxtrapolate.records import Frame, replace
+from jaxtrapolate.records import Frame, record, replace
 from jaxtrapolate.timing import Timing, measure
 
 DEFAULT_METRICS = ("psnr", "ssim")
@@ -36,6 +36,7 @@ def hide(frame: Frame) -> Frame:
     return replace(frame, color=None, gbuffer=buffers)
 
 
+@record
 @dataclasses.dataclass(frozen=True)
 class Window:
     """A held-back frame and what surrounds it: the true frame, and history, target and future as methods see them."""

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxtrapolate.checks import missing_package
+from jaxtrapolate.checks import check_choice, missing_package
 from jaxtrapolate.records import Frame, check_frame
 
 Values = Mapping[str, Any]
@@ -119,6 +119,19 @@ class Method:
             elif not stage.optional:
                 raise ValueError(f"method {self.name!r}, stage {stage.name!r}: missing {', '.join(lacks)}")
         return tuple(stages)
+
+    def before(self, stage: str, history: Frames, target: Frame, future: Frames = ()) -> dict[str, Any]:
+        """The values that the stages before the one named `stage` make, without a carry: what training prepares.
+
+        Raises:
+            ValueError: see `active`; or no stage of that name runs on frames like these.
+        """
+        self._check(history, target, future)
+        stages = self.active(history, target, future)
+        names = [s.name for s in stages]
+        check_choice("stage", stage, names)
+        values = {"carry": (), "history": history, "target": target, "future": future}
+        return values | _run(stages[: names.index(stage)], self.state, values)
 
     def _lacks(self, stage: Stage, history: Frames, target: Frame, future: Frames) -> list[str]:
         sources = [history[i] for i in rendered(history)][: self.past]

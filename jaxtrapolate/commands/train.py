@@ -1,0 +1,65 @@
+"""`jaxtrapolate train`: train a network as a configuration says."""
+
+import argparse
+import sys
+from typing import Any
+
+from rich.console import Console
+
+from jaxtrapolate.commands.inputs import output_folder, steps
+from jaxtrapolate.files import InputError
+
+
+def add_parser(subparsers: Any) -> None:
+    """Adds the command to the command line."""
+    parser = subparsers.add_parser(
+        "train",
+        help="train a network",
+        description="Trains a network as a configuration says, from the workdir's last checkpoint on, on all devices. "
+        "Over several hosts the command is run on each, with a workdir that they share.",
+    )
+    parser.add_argument("config", metavar="CONFIG", help="a TOML file, or the name of a shipped configuration")
+    parser.add_argument("--workdir", required=True, metavar="DIR", help="for checkpoints, metrics, images, the model")
+    parser.add_argument(
+        "--distributed",
+        action="store_true",
+        help="over several hosts, as the cluster's environment says (Slurm, Open MPI, Kubernetes, Cloud TPU)",
+    )
+    parser.add_argument("--coordinator", metavar="HOST:PORT", help="over several hosts: where the first can be reached")
+    parser.add_argument("--processes", type=int, metavar="N", help="with --coordinator: how many there are")
+    parser.add_argument("--process", type=int, metavar="I", help="with --coordinator: which this one is, from 0 on")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the command; 1 where the run broke off, because its loss was not finite."""
+    _join(options)
+    from jaxtrapolate.training import TrainingError, load_config, train_and_evaluate
+
+    console = Console(stderr=True)
+    config = load_config(options.config)
+    folder = output_folder(options.workdir)
+    try:
+        with steps(console) as report:
+            scores = train_and_evaluate(config, folder, report=report)
+    except TrainingError as error:
+        print(f"jaxtrapolate: {error}", file=sys.stderr)
+        return 1
+    text = ", ".join(f"{name} {value:.4g}" for name, value in scores.items() if value is not None)
+    console.print(f"{config.steps} steps of {config.task}: {text}; in {folder}", soft_wrap=True, highlight=False)
+    return 0
+
+
+def _join(options: argparse.Namespace) -> None:
+    """Joins the processes of a run over several hosts, before anything is computed."""
+    given = (options.coordinator, options.processes, options.process)
+    if any(value is not None for value in given) and any(value is None for value in given):
+        raise InputError("--coordinator, --processes, --process: belong together; give all three or none")
+    if options.coordinator is None and not options.distributed:
+        return
+    import jax
+
+    try:
+        jax.distributed.initialize(*given)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"--{'coordinator' if options.coordinator else 'distributed'}: {error}") from error

@@ -1,0 +1,104 @@
+"""Augmentation: mirrored frames, whose world is mirrored with them, and random crops."""
+
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, PRNGKeyArray
+
+from jaxtrapolate.checks import Size
+from jaxtrapolate.records import Camera, Frame, GBuffer, replace
+
+T = TypeVar("T")
+
+Flag = bool | Bool[Array, ""]
+
+
+def flip(tree: T, *, horizontal: Flag, vertical: Flag) -> T:
+    """Mirror all `Frame`s in a pytree left to right, top to bottom, or both; flags may be traced.
+
+    The frames are those of a mirrored world: a horizontal flip mirrors the world's x, a vertical one its z. So normals
+    and positions change sign along these axes, in all frames alike, whatever the camera, known or not: distances and
+    angles between frames stay what they were, and there is a camera that sees exactly this. Where the camera is known
+    it becomes that one, view' = D view M and projection' = D projection D with D the mirror of the screen, M of the
+    world; projecting the mirrored positions by it gives the mirrored pixels.
+
+    Mirroring at the plane of a camera instead leaves that camera as it is, but each frame has another, and that of a
+    tilted one would tilt the mirrored world. Where z is up, a vertical flip turns the world upside down and leaves
+    level what was level; where y is up, the picture is as valid, with a camera that is rolled by half a turn.
+
+    Args:
+        tree: a `Frame`, a `Window`, or any pytree that holds such; what is not in a frame stays as it is.
+        horizontal: whether left and right are exchanged.
+        vertical: whether top and bottom are.
+    """
+
+    def one(value: Any) -> Any:
+        return _flip(value, horizontal, vertical) if isinstance(value, Frame) else value
+
+    return jax.tree.map(one, tree, is_leaf=lambda value: isinstance(value, Frame))
+
+
+def _flip(frame: Frame, horizontal: Flag, vertical: Flag) -> Frame:
+    x, y = (jnp.where(flag, -1.0, 1.0) for flag in (horizontal, vertical))
+    one = jnp.ones(())
+
+    def image(value: Any) -> Array:
+        value = jnp.asarray(value)
+        value = jnp.where(horizontal, value[:, ::-1], value)
+        return jnp.where(vertical, value[::-1], value)
+
+    def signed(value: Any, *signs: Array) -> Array:
+        return value * jnp.stack(signs).astype(value.dtype)
+
+    fields: dict[str, Any] = {}
+    for name in ("color", "motion"):
+        if getattr(frame, name) is not None:
+            fields[name] = image(getattr(frame, name))
+    if frame.motion is not None:
+        fields["motion"] = signed(fields["motion"], x, y)
+    if frame.jitter is not None:
+        fields["jitter"] = signed(frame.jitter, x, y)
+    if frame.gbuffer is not None:
+        buffers: GBuffer = jax.tree.map(image, frame.gbuffer)
+        vectors = {name: getattr(buffers, name) for name in ("normal", "position")}
+        fields["gbuffer"] = replace(
+            buffers, **{name: signed(value, x, one, y) for name, value in vectors.items() if value is not None}
+        )
+    if frame.camera is not None:
+        screen, world = jnp.stack([x, y, one, one]), jnp.stack([x, one, y, one])
+        view, projection = frame.camera.view, frame.camera.projection
+        fields["camera"] = Camera(
+            view=None if view is None else view * screen[:, None] * world,
+            projection=None if projection is None else projection * screen[:, None] * screen,
+        )
+    return replace(frame, **fields)
+
+
+def crop(tree: T, key: PRNGKeyArray, *, size: Size) -> T:
+    """Cut the same random rectangle of `size` `(H, W)` out of all images `[H, W, ...]` of a pytree.
+
+    Every leaf is one. Cut what has been warped, not what is still to be warped: motion leads out of a crop.
+
+    Args:
+        tree: images of one size.
+        key: of the place, which is uniform over all those inside the frame.
+        size: of the crop.
+
+    Raises:
+        ValueError: leaves of different sizes, or smaller than `size`.
+    """
+    shapes = {jnp.shape(leaf)[:2] for leaf in jax.tree.leaves(tree)}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 2:
+        raise ValueError(f"tree: expected images of one size, got {sorted(shapes)}")
+    (whole,) = shapes
+    if whole[0] < size[0] or whole[1] < size[1]:
+        raise ValueError(f"size: expected at most the images' {list(whole)}, got {list(size)}")
+    room = jnp.array([whole[0] - size[0] + 1, whole[1] - size[1] + 1])
+    top, left = jax.random.randint(key, (2,), 0, room)
+
+    def cut(image: Array) -> Array:
+        zeros = (0,) * (image.ndim - 2)
+        return jax.lax.dynamic_slice(image, (top, left, *zeros), (*size, *image.shape[2:]))
+
+    return jax.tree.map(cut, tree)

@@ -1,0 +1,90 @@
+"""Checkpoints that a kill at any moment leaves whole, and the trained weights."""
+
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+from flax import nnx
+from orbax.checkpoint import checkpoint_managers as policies
+
+from jaxtrapolate.files import InputError
+
+
+class Checkpoints:
+    """The states of a run by step, in a folder: the last few and the best.
+
+    Orbax writes each into a folder of another name, which takes its own only when it is complete; what a kill leaves is
+    removed when the run goes on. With several hosts all of them call `save` and `restore`.
+
+    Args:
+        folder: for the checkpoints.
+        keep: how many of the last.
+        score: name of the metric by which one more is kept, the one where it is largest; NaN counts as the least.
+    """
+
+    def __init__(self, folder: Path, *, keep: int, score: str) -> None:
+        def value(metrics: Mapping[str, float]) -> float:
+            found = float(metrics[score])
+            return -math.inf if math.isnan(found) else found
+
+        best = policies.BestN(get_metric_fn=value, n=1, keep_checkpoints_without_metrics=False)
+        options = ocp.CheckpointManagerOptions(
+            preservation_policy=policies.AnyPreservationPolicy([policies.LatestN(keep), best]),
+            cleanup_tmp_directories=True,
+            enable_async_checkpointing=False,
+        )
+        self._manager = ocp.CheckpointManager(folder.absolute(), options=options)
+
+    def latest(self) -> int | None:
+        """The step of the last checkpoint."""
+        return self._manager.latest_step()
+
+    def steps(self) -> tuple[int, ...]:
+        """The steps of all of them, ascending."""
+        return tuple(sorted(self._manager.all_steps()))
+
+    def save(self, step: int, state: Any, metrics: Mapping[str, float] | None = None) -> None:
+        """Saves a state; metrics: of its validation, where there was one."""
+        self._manager.save(step, args=ocp.args.StandardSave(state), metrics=None if metrics is None else dict(metrics))
+
+    def restore(self, step: int, like: Any) -> Any:
+        """The state of a step, with the structure, types and places of the arrays `like`."""
+        target = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
+        return self._manager.restore(step, args=ocp.args.StandardRestore(target))
+
+    def __enter__(self) -> "Checkpoints":
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._manager.close()
+
+
+def model_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
+    """A network's weights and statistics as NumPy arrays, named by their places in it, as "down1/feature/kernel"."""
+    _, state, _ = nnx.split(model, (nnx.Param, nnx.BatchStat), ...)
+    pairs = nnx.to_flat_state(state)
+    return {"/".join(map(str, path)): np.asarray(variable[...]) for path, variable in pairs}
+
+
+def save_model(folder: Path, model: nnx.Module) -> None:
+    """Saves `model_arrays` as an Orbax checkpoint, in place of what was there; all hosts call it."""
+    with ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save(folder.absolute(), model_arrays(model), force=True)
+
+
+def read_model(folder: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """The arrays that `save_model` saved, by name; raises `InputError` where there are none."""
+    path = Path(folder).absolute()
+    if not path.is_dir():
+        raise InputError(f"{folder}: no trained model there; give the folder `model` of a workdir")
+    with ocp.StandardCheckpointer() as checkpointer:
+        try:
+            return checkpointer.restore(path)
+        except (ValueError, FileNotFoundError) as error:
+            raise InputError(f"{folder}: no model that can be read ({' '.join(str(error).split())})") from error

@@ -1,0 +1,289 @@
+"""Configurations of training runs: frozen dataclasses, read from TOML files, strictly.
+
+A file holds the fields of `Config`; the table `[options]` those of the task's own dataclass:
+
+    task = "extranet"
+    steps = 100000
+
+    [optimizer]
+    learning_rate = 1e-3
+
+    [options]
+    crop = [128, 128]
+"""
+
+import dataclasses
+import json
+import os
+import tomllib
+import types
+import typing
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from jaxtrapolate.files import InputError
+from jaxtrapolate.files.atomic import atomic_path, os_input_error
+from jaxtrapolate.training.tasks import Task, find_task
+
+T = TypeVar("T")
+
+Precision = Literal["float32", "bfloat16"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Optimizer:
+    """Adam and the course of its learning rate: linear warm-up, constant, then half a cosine.
+
+    Attributes:
+        learning_rate: at its height.
+        warmup: steps in which it rises linearly from 0.
+        constant: steps at its height after that.
+        decay: steps from there to the end of the cosine, which a run may stop short of; by default the rest of the run.
+        floor: what it ends at, as a fraction of its height.
+        beta1, beta2, epsilon: Adam's (Kingma and Ba 2015).
+        weight_decay: decoupled (Loshchilov and Hutter 2019), 0 for none.
+        clip: the gradient's largest norm, over all weights; not clipped where absent.
+    """
+
+    learning_rate: float = 1e-3
+    warmup: int = 0
+    constant: int = 0
+    decay: int | None = None
+    floor: float = 0.0
+    beta1: float = 0.9
+    beta2: float = 0.999
+    epsilon: float = 1e-8
+    weight_decay: float = 0.0
+    clip: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("learning_rate", "epsilon"):
+            check_range(self, name, above=0)
+        for name in ("warmup", "constant", "weight_decay"):
+            check_range(self, name, least=0)
+        for name in ("beta1", "beta2"):
+            check_range(self, name, least=0, below=1)
+        check_range(self, "floor", least=0, most=1)
+        if self.decay is not None:
+            check_range(self, "decay", least=1)
+        if self.clip is not None:
+            check_range(self, "clip", above=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """All that determines a training run.
+
+    Attributes:
+        task: its name, see `jaxtrapolate.training.tasks`.
+        options: the task's own dataclass.
+        steps: of the optimiser, in all.
+        seed: of the initial weights, the examples and the batches.
+        batch: items a step, over all devices.
+        pool: examples that are made at a time, a multiple of `batch`.
+        steps_per_round: steps between one pool and the next.
+        optimizer: see `Optimizer`.
+        average: decay a step of the average of the weights that is validated and exported; the weights themselves where
+            absent.
+        precision: of the network while training; weights, averages and validation stay float32.
+        log_every: steps from one line of the log to the next, the only times at which the host waits for the devices.
+        checkpoint_every, validate_every: steps, multiples of `log_every`.
+        keep: how many of the last checkpoints are kept, beside the best.
+    """
+
+    task: str
+    options: Any
+    steps: int
+    seed: int = 0
+    batch: int = 8
+    pool: int = 64
+    steps_per_round: int = 64
+    optimizer: Optimizer = dataclasses.field(default_factory=Optimizer)
+    average: float | None = None
+    precision: Precision = "float32"
+    log_every: int = 50
+    checkpoint_every: int = 500
+    validate_every: int = 1000
+    keep: int = 3
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "pool", "steps_per_round", "log_every", "keep"):
+            check_range(self, name, least=1)
+        check_range(self, "seed", least=0, below=2**32)
+        if self.average is not None:
+            check_range(self, "average", least=0, below=1)
+        if self.pool % self.batch:
+            raise ValueError(f"pool: expected a multiple of batch = {self.batch}, got {self.pool}")
+        for name in ("checkpoint_every", "validate_every"):
+            check_range(self, name, least=1)
+            if getattr(self, name) % self.log_every:
+                raise ValueError(
+                    f"{name}: expected a multiple of log_every = {self.log_every}, got {getattr(self, name)}"
+                )
+
+
+def check_range(
+    record: Any,
+    name: str,
+    *,
+    least: int | float | None = None,
+    most: int | float | None = None,
+    above: int | float | None = None,
+    below: int | float | None = None,
+) -> None:
+    """Raise `ValueError` unless a field of a dataclass is finite and within the bounds that are given."""
+    value = getattr(record, name)
+    bounds = {"at least": least, "at most": most, "above": above, "below": below}
+    fits = {
+        "at least": lambda b: value >= b,
+        "at most": lambda b: value <= b,
+        "above": lambda b: value > b,
+        "below": lambda b: value < b,
+    }
+    given = {text: bound for text, bound in bounds.items() if bound is not None}
+    finite = abs(value) < float("inf")  # no NaN either
+    if not (finite and all(fits[text](bound) for text, bound in given.items())):
+        raise ValueError(f"{name}: expected {' and '.join(f'{t} {b}' for t, b in given.items())}, got {value}")
+
+
+def parse(cls: type[T], table: Mapping[str, Any], *, where: str = "") -> T:
+    """A frozen dataclass from a table of plain values, whose names and types must fit; `where` is the table's name.
+
+    Integers stand for real numbers, arrays for tuples, tables for dataclasses; a field that may be `None` is left out.
+
+    Raises:
+        ValueError: one line that names the key, what was expected, and what is there.
+    """
+    prefix = f"{where}." if where else ""
+    fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    for key in table:
+        if key not in fields:
+            raise ValueError(f"{prefix}{key}: no such setting; there are {', '.join(fields) or 'none'}")
+    hints = typing.get_type_hints(cls)
+    values = {key: _convert(hints[key], value, f"{prefix}{key}") for key, value in table.items()}
+    needed = (f for f in fields.values() if f.name not in values)
+    for field in needed:
+        if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            raise ValueError(f"{prefix}{field.name}: missing; it has no default")
+    try:
+        return cls(**values)
+    except ValueError as error:
+        raise ValueError(f"{prefix}{error}") from None
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    """A plain value as what a type hint asks for."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any:
+        return value
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        if not isinstance(value, Mapping):
+            raise ValueError(f"{where}: expected a table, got {value!r}")
+        return parse(hint, value, where=where)
+    if origin in (typing.Union, types.UnionType):
+        (hint,) = (a for a in arguments if a is not type(None))  # optional; TOML has no null
+        return _convert(hint, value, where)
+    if origin is Literal:
+        if value not in arguments or isinstance(value, bool):
+            raise ValueError(f"{where}: expected one of {', '.join(map(repr, arguments))}, got {value!r}")
+        return value
+    if origin is tuple:
+        repeated = len(arguments) == 2 and arguments[1] is Ellipsis
+        if not isinstance(value, list | tuple) or not (repeated or len(value) == len(arguments)):
+            raise ValueError(f"{where}: expected an array{'' if repeated else f' of {len(arguments)}'}, got {value!r}")
+        each = [arguments[0]] * len(value) if repeated else arguments
+        return tuple(_convert(a, v, f"{where}[{i}]") for i, (a, v) in enumerate(zip(each, value, strict=True)))
+    names = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
+    accepted: Any = (int, float) if hint is float else hint
+    if isinstance(value, bool) is not (hint is bool) or not isinstance(value, accepted):
+        raise ValueError(f"{where}: expected {names[hint]}, got {value!r}")
+    return float(value) if hint is float else value
+
+
+def parse_config(table: Mapping[str, Any]) -> Config:
+    """A `Config` from a table, its options by the task that it names. Raises `ValueError` as `parse` does."""
+    name = table.get("task")
+    if not isinstance(name, str):
+        raise ValueError("task: missing; it has no default" if name is None else f"task: expected a text, got {name!r}")
+    options = table.get("options", {})
+    if not isinstance(options, Mapping):
+        raise ValueError(f"options: expected a table, got {options!r}")
+    made = parse(find_task(name).options, options, where="options")
+    return parse(Config, {**table, "options": made})
+
+
+def load_config(name: str | os.PathLike[str]) -> Config:
+    """The configuration in a TOML file, or the shipped one of that name (see `config_names`).
+
+    Raises:
+        InputError: no such file, no TOML, an unknown key, a wrong type or value, in one line that names the key.
+    """
+    text = os.fspath(name)
+    shipped = _shipped()
+    try:
+        content = shipped[text].read_text() if text in shipped else Path(text).read_text(encoding="utf-8")
+        return parse_config(tomllib.loads(content))
+    except OSError as error:
+        if not text.endswith(".toml") and not Path(text).exists():
+            there = f"the shipped ones are {', '.join(shipped)}" if shipped else "none are shipped"
+            raise InputError(f"{text}: no such configuration or TOML file; {there}") from error
+        raise os_input_error(text, error) from error
+    except (ValueError, UnicodeDecodeError) as error:  # also what is no TOML
+        raise InputError(f"{text}: {error}") from error
+
+
+def config_names() -> tuple[str, ...]:
+    """The names of the shipped configurations."""
+    return tuple(_shipped())
+
+
+def _shipped() -> dict[str, Any]:
+    folder = resources.files("jaxtrapolate.training").joinpath("configs")
+    files = sorted(folder.iterdir(), key=lambda f: f.name) if folder.is_dir() else []
+    return {f.name.removesuffix(".toml"): f for f in files if f.name.endswith(".toml")}
+
+
+def make_task(config: Config) -> Task:
+    """The task of a configuration."""
+    return find_task(config.task).make(config.options)
+
+
+def keep_config(config: Config, path: Path, *, write: bool = True) -> None:
+    """Writes a configuration as JSON where there is none; otherwise checks that it is the same.
+
+    Args:
+        config: of this run.
+        path: of the file.
+        write: False = only check.
+
+    Raises:
+        InputError: the file's differs; the fields are named.
+    """
+    new = json.loads(json.dumps(dataclasses.asdict(config)))
+    try:
+        old = json.loads(path.read_text()) if path.exists() else None
+    except OSError as error:
+        raise os_input_error(path, error) from error
+    except ValueError as error:
+        raise InputError(f"{path}: no JSON ({error}); choose another workdir") from error
+    if old is not None:
+        before, after = _flat(old), _flat(new)
+        differ = [k for k in {**before, **after} if before.get(k) != after.get(k)]
+        if differ:
+            changes = "; ".join(f"{k} was {_show(before, k)}, is now {_show(after, k)}" for k in differ)
+            raise InputError(f"{path.parent}: holds a run of another configuration: {changes}; choose another workdir")
+    elif write:
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(new, indent=1))
+
+
+def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(value, dict):
+        return {prefix: value}
+    return {k: v for key, sub in value.items() for k, v in _flat(sub, f"{prefix}.{key}" if prefix else key).items()}
+
+
+def _show(table: dict[str, Any], key: str) -> str:
+    return json.dumps(table[key]) if key in table else "not there"

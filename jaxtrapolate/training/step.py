@@ -1,0 +1,165 @@
+"""One step of training: what is carried from step to step, and the pure function that takes the next."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx
+from jax.sharding import PartitionSpec
+from jaxtyping import Array, Float, Int
+
+from jaxtrapolate.records import record, replace
+from jaxtrapolate.training import devices
+from jaxtrapolate.training.config import Config, Optimizer
+from jaxtrapolate.training.tasks import Batch, Example, Task, init_key, step_key
+
+
+@record
+@dataclasses.dataclass(frozen=True)
+class State:
+    """What is carried from step to step, and saved.
+
+    step: how many were taken. weights: the network's `nnx.Param`. statistics: its `nnx.BatchStat`. rest: what else it
+    holds. moments: the optimiser's. average: running averages of (weights, statistics), `None` where not asked for.
+    """
+
+    step: Int[Array, ""]
+    weights: Any
+    statistics: Any
+    rest: Any
+    moments: Any
+    average: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """The functions of a run, made by `make_step`.
+
+    Attributes:
+        create: `() -> State`, the initial one.
+        take: `(state, pool) -> (state, metrics)`, compiled; the old state's memory is given up. metrics are scalars on
+            the devices: "loss", "gradient" (its norm, before clipping), "learning_rate", and the task's.
+        batch: `(pool, number) -> batch` of the step with that number, as `take` cuts it.
+        model: `(state) -> nnx.Module`, the averaged network in evaluation mode, on this host's first device.
+    """
+
+    create: Callable[[], State]
+    take: Callable[[State, Example], tuple[State, dict[str, Array]]]
+    batch: Callable[[Example, Any], Batch]
+    model: Callable[[State], nnx.Module]
+
+
+def schedule(optimizer: Optimizer, steps: int) -> optax.Schedule:
+    """The learning rate by step, counted from 0."""
+    height, rise, level = optimizer.learning_rate, optimizer.warmup, optimizer.constant
+    decay = optimizer.decay or max(1, steps - rise - level)
+    fall = optax.cosine_decay_schedule(height, decay, alpha=optimizer.floor)
+    rest = optax.join_schedules([optax.constant_schedule(height), fall], [level])
+    return optax.join_schedules([optax.linear_schedule(0.0, height, rise), rest], [rise]) if rise else rest
+
+
+def transformation(optimizer: Optimizer, steps: int) -> optax.GradientTransformation:
+    """Clipping where asked for, then Adam with its schedule."""
+    adam = optax.adamw(
+        schedule(optimizer, steps),
+        b1=optimizer.beta1,
+        b2=optimizer.beta2,
+        eps=optimizer.epsilon,
+        weight_decay=optimizer.weight_decay,
+    )
+    return adam if optimizer.clip is None else optax.chain(optax.clip_by_global_norm(optimizer.clip), adam)
+
+
+def _cast(tree: Any, precision: str) -> Any:
+    """The weights in which the network computes."""
+    dtype = jnp.dtype(precision)
+    return jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, tree)
+
+
+def _averaged(decay: float, count: Array, old: Any, new: Any) -> Any:
+    """The running average after `count` steps; at first it forgets faster, so that it does not stay at the start."""
+    keep = jnp.minimum(decay, (1.0 + count) / (10.0 + count))
+    return jax.tree.map(lambda o, n: (o * keep + n * (1 - keep)).astype(o.dtype), old, new)
+
+
+def make_step(task: Task, config: Config) -> Step:
+    """The functions of a run of `task` by `config`.
+
+    The pool is divided along its leading axis, and so is the batch: slot b of every batch holds examples of the b-th
+    part of the pool, so that no example ever moves from one device to another, and the same examples are drawn on any
+    number of devices.
+    """
+    optimizer = transformation(config.optimizer, config.steps)
+    rate = schedule(config.optimizer, config.steps)
+
+    def split(training: bool) -> tuple[Any, ...]:
+        model = task.init(nnx.Rngs(init_key(config.seed)))
+        model.train() if training else model.eval()
+        return nnx.split(model, nnx.Param, nnx.BatchStat, ...)
+
+    graph, evaluated = (nnx.eval_shape(lambda t=training: split(t))[0] for training in (True, False))
+
+    def create() -> State:
+        _, weights, statistics, rest = split(True)
+        average = None if config.average is None else (weights, statistics)
+        return State(jnp.zeros((), jnp.int32), weights, statistics, rest, optimizer.init(weights), average)
+
+    def cut(pool: Example, keys: Any) -> Batch:
+        """A device's part of a batch from its part of the pool."""
+        parts = jax.tree.map(lambda a: a.reshape(len(keys), -1, *a.shape[1:]), pool)
+
+        def one(part: Example, key: Any) -> Batch:
+            choice, own = jax.random.split(key)
+            (count,) = {a.shape[0] for a in jax.tree.leaves(part)}
+            index = jax.random.randint(choice, (), 0, count)
+            return task.sample(jax.tree.map(lambda a: a[index], part), own)
+
+        return jax.vmap(one)(parts, keys)
+
+    over = PartitionSpec(devices.AXIS)
+    cut_all = jax.shard_map(cut, mesh=devices.mesh(), in_specs=(over, over), out_specs=over)
+
+    def batch_of(pool: Example, number: Any) -> Batch:
+        return cut_all(pool, jax.random.split(step_key(config.seed, number), config.batch))
+
+    def take(state: State, pool: Example) -> tuple[State, dict[str, Array]]:
+        batch = batch_of(pool, state.step)
+
+        def loss_of(weights: Any) -> tuple[Float[Array, ""], tuple[Any, Any, dict[str, Array]]]:
+            model = nnx.merge(graph, _cast(weights, config.precision), state.statistics, state.rest, copy=True)
+            loss, metrics = task.loss(model, batch)
+            _, _, statistics, rest = nnx.split(model, nnx.Param, nnx.BatchStat, ...)
+            return loss.astype(jnp.float32), (statistics, rest, dict(metrics))
+
+        (loss, (statistics, rest, metrics)), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.weights)
+        updates, moments = optimizer.update(gradient, state.moments, state.weights)
+        weights = optax.apply_updates(state.weights, updates)
+        average = state.average
+        if config.average is not None:
+            average = _averaged(config.average, state.step, average, (weights, statistics))
+        metrics |= {"loss": loss, "gradient": optax.tree.norm(gradient), "learning_rate": rate(state.step)}
+        made = replace(
+            state,
+            step=state.step + 1,
+            weights=weights,
+            statistics=statistics,
+            rest=rest,
+            moments=moments,
+            average=average,
+        )
+        return made, metrics
+
+    def model(state: State) -> nnx.Module:
+        weights, statistics = state.average or (state.weights, state.statistics)
+        return nnx.merge(evaluated, *devices.local((weights, statistics, state.rest)), copy=True)
+
+    whole = devices.replicated()
+    return Step(
+        create=jax.jit(create, out_shardings=whole),
+        take=jax.jit(take, donate_argnums=0, out_shardings=(whole, whole)),
+        batch=jax.jit(batch_of),
+        model=model,
+    )

@@ -1,0 +1,244 @@
+"""Examples: a frame to be made and what surrounds it, from the embedded scenes without end, or from dumps.
+
+An example is a `Window`, as evaluation hands it to methods: history of rendered frames with the buffers of the frames
+between them, the target without colour, the truth. A task runs its method's own stages on it, up to the network
+(`Method.before`), once for each example of a pool and at full frame; batches are cut from what that gives.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, Mesh, PartitionSpec
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxtrapolate.checks import Size, check_choice
+from jaxtrapolate.evaluation import Window, hide
+from jaxtrapolate.evaluation import windows as windows_of
+from jaxtrapolate.files import InputError, Sequence, open_sequence, runs
+from jaxtrapolate.records import Frame, replace
+from jaxtrapolate.scenes import TRAINING_SEEDS, Scene, render, scene, scene_names, stack_scenes
+from jaxtrapolate.training.augment import flip
+from jaxtrapolate.training.config import check_range
+from jaxtrapolate.training.tasks import Example
+
+MotionPath = Literal["chained", "direct"]
+
+VALIDATION_SEEDS = TRAINING_SEEDS[-(2**20) :]
+"""Seeds of the scenes that validation sees and training does not; none is a test seed."""
+
+SEEDS = TRAINING_SEEDS[: -(2**20)]
+"""Seeds of the scenes that training sees."""
+
+MOVING = tuple(name for name in scene_names() if name != "still")
+"""The scenes in which something moves."""
+
+Prepare = Callable[[Window, PRNGKeyArray], Example]
+"""What a task makes of a window, once: pure and traced; for windows of several sizes cut to one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WindowOptions:
+    """Which windows a pool is made of.
+
+    Attributes:
+        size: `(H, W)` of frames of embedded scenes.
+        scenes: their names.
+        weights: how often each scene is taken; equally often where empty.
+        step: frames' least and largest distance in a scene's own time, uniform between; 1 is what evaluation has.
+        time: of the target, the least and the largest, uniform between.
+        motion: "chained" = as in evaluation, motion leads from frame to frame, through frames with buffers alone;
+            "direct" = exact motion from one rendered frame to the next, without the frames between.
+        flip: how likely a window is mirrored left to right, and top to bottom.
+        together: how many windows in a row are of one scene; accelerators render these at once.
+        dumps: folders of frames with all buffers, see `jaxtrapolate.files.open_sequence`.
+        dumps_share: of the windows that are of dumps, where there are any; each window of all dumps is equally likely.
+    """
+
+    size: tuple[int, int] = (192, 256)
+    scenes: tuple[str, ...] = MOVING
+    weights: tuple[float, ...] = ()
+    step: tuple[float, float] = (0.5, 1.5)
+    time: tuple[float, float] = (0.0, 120.0)
+    motion: MotionPath = "chained"
+    flip: tuple[float, float] = (0.5, 0.0)
+    together: int = 1
+    dumps: tuple[str, ...] = ()
+    dumps_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        if min(self.size) < 1:
+            raise ValueError(f"size: expected [H, W] of at least 1, got {list(self.size)}")
+        for name in self.scenes:
+            check_choice("scenes", name, scene_names())
+        if self.weights and (len(self.weights) != len(self.scenes) or min(self.weights) < 0 or sum(self.weights) <= 0):
+            raise ValueError(f"weights: expected a share for each of {len(self.scenes)} scenes, got {self.weights}")
+        for name in ("step", "time"):
+            low, high = getattr(self, name)
+            if not -np.inf < low <= high < np.inf or (name == "step" and low <= 0):
+                raise ValueError(f"{name}: expected [least, largest]{' above 0' * (name == 'step')}, got {[low, high]}")
+        if not all(0 <= p <= 1 for p in self.flip):
+            raise ValueError(f"flip: expected two probabilities, got {list(self.flip)}")
+        check_range(self, "together", least=1)
+        check_range(self, "dumps_share", least=0, most=1)
+        if not (self.dumps if self.dumps_share == 1 else self.scenes):
+            raise ValueError(f"{'dumps' if self.dumps_share == 1 else 'scenes'}: expected some, got none")
+
+
+def scene_window(
+    world: Scene,
+    time: Float[Array, ""],
+    step: Float[Array, ""],
+    *,
+    size: Size,
+    past: int,
+    future: int = 0,
+    motion: MotionPath = "chained",
+) -> Window:
+    """The window about a time of a scene, as evaluation has it of a sequence whose frames are `step` apart.
+
+    Frames' times are counted from the target's, in frames: history at -1, -3, ..., future at 1, 3, ..., and with
+    "chained" motion the frames between them, which have neither colour nor shadow nor sky colour. The number is 0.
+    Jitted with `size`, `past`, `future` and `motion` static, what is not handed over is not computed; each of the two
+    kinds of frame is compiled once, in a loop.
+
+    Args:
+        world: from `scene`.
+        time: of the target, in the scene's time.
+        step: from one frame to the next, in the scene's time; may be any real number but 0.
+        size: `(H, W)`.
+        past: rendered frames before the target.
+        future: rendered frames after it.
+        motion: see `WindowOptions`.
+    """
+    shown = [*range(1 - 2 * past, 0, 2), 0, *range(1, 2 * future, 2)]
+    between = [*range(2 - 2 * past, 0, 2), *range(2, 2 * future, 2)]
+    if motion == "direct":
+        jobs = [(render, {offset: 1 if offset in (0, 1) else 2 for offset in shown})]
+    else:
+        jobs = [(render, dict.fromkeys(shown, 1)), (_buffers, dict.fromkeys(between, 1))]
+    frames: dict[int, Frame] = {}
+    for draw, gaps in jobs:
+        if gaps:
+
+            def one(pair: tuple[Array, Array], draw=draw) -> Frame:
+                return draw(world, pair[0], size=size, previous_time=pair[1])
+
+            offset, gap = jnp.array([*gaps], jnp.float32), jnp.array([*gaps.values()], jnp.float32)
+            stacked = jax.lax.map(one, (time + offset * step, time + (offset - gap) * step))
+            for i, number in enumerate(gaps):
+                frame = jax.tree.map(lambda leaf, i=i: leaf[i], stacked)
+                frames[number] = replace(frame, time=jnp.float32(number))
+    return Window(
+        number=0,
+        truth=frames[0],
+        history=tuple(frames[k] for k in sorted(frames) if k < 0),
+        target=hide(frames[0]),
+        future=tuple(frames[k] for k in sorted(frames) if k > 0),
+    )
+
+
+def _buffers(world: Scene, time: Array, *, size: Size, previous_time: Array) -> Frame:
+    return hide(render(world, time, size=size, previous_time=previous_time))
+
+
+def _mapped(function: Callable[..., Any], count: int) -> Callable[..., Any]:
+    """`function` over a leading axis of `count`, compiled.
+
+    On CPUs one by one, elsewhere at once, and divided among this host's devices where that comes out even.
+    """
+
+    def over(*arguments: Any) -> Any:
+        if jax.default_backend() == "cpu":
+            return jax.lax.map(lambda one: function(*one), arguments)
+        return jax.vmap(function)(*arguments)
+
+    own = jax.local_devices()
+    if len(own) > 1 and count % len(own) == 0:
+        mesh = Mesh(np.array(own), ("example",), axis_types=(AxisType.Auto,))
+        along = PartitionSpec("example")
+        return jax.jit(jax.shard_map(over, mesh=mesh, in_specs=along, out_specs=along, check_vma=False))
+    return jax.jit(over)
+
+
+class Windows:
+    """Pools of prepared windows, each determined by a key and its number.
+
+    Args:
+        options: which windows.
+        prepare: what is kept of each; see `Prepare`.
+        past: rendered frames before the target that a window has.
+        future: rendered frames after it.
+
+    Raises:
+        InputError: a dump that cannot be read, or is too short for a window.
+    """
+
+    def __init__(self, options: WindowOptions, prepare: Prepare, *, past: int, future: int = 0) -> None:
+        self.options, self._past, self._future = options, past, future
+        self._dumps = [(s, self._numbers(s)) for s in map(open_sequence, options.dumps)]
+        draw = functools.partial(scene_window, size=options.size, past=past, future=future, motion=options.motion)
+        self._render = _mapped(draw, options.together)
+        self._prepare = _mapped(lambda w, h, v, key: prepare(flip(w, horizontal=h, vertical=v), key), options.together)
+
+    def _numbers(self, sequence: Sequence) -> list[int]:
+        """The frames of a sequence that have all that a window needs around them."""
+        before, behind = 2 * self._past - 1, max(0, 2 * self._future - 1)
+        numbers = [n for run in runs(sequence) for n in run[before : len(run) - behind]]
+        needed = [0, *range(-before, 0, 2), *range(1, behind + 1, 2)]
+        numbers = [n for n in numbers if all(sequence.has_color(n + k) for k in needed)]
+        if not numbers:
+            raise InputError(f"{sequence.name}: has no {before + 1 + behind} frames in a row for a window")
+        return numbers
+
+    def pool(self, key: PRNGKeyArray, numbers: range, *, validation: bool = False) -> Example:
+        """The prepared windows `numbers` of the pool that a key stands for, stacked along a leading axis.
+
+        validation: of scenes by `VALIDATION_SEEDS` instead of `SEEDS`.
+
+        Raises:
+            ValueError: `prepare` gives arrays of several shapes.
+        """
+        words = np.asarray(jax.random.key_data(key)).tolist()
+        together = self.options.together
+        first, last = numbers.start // together, -(-numbers.stop // together)
+        blocks = [self._block(key, words, number, validation) for number in range(first, last)]
+        shapes = {str(jax.tree.map(lambda a: a.shape[1:], block)) for block in blocks}
+        if len(shapes) > 1:
+            raise ValueError(f"prepare: expected arrays of the same shapes of every window, got {' and '.join(shapes)}")
+        skipped = numbers.start - first * together
+        return jax.tree.map(lambda *a: jnp.concatenate(a)[skipped : skipped + len(numbers)], *blocks)
+
+    def _block(self, key: PRNGKeyArray, words: list[int], number: int, validation: bool) -> Example:
+        """The windows of one scene or dump that are made together."""
+        options, count = self.options, self.options.together
+        rng = np.random.default_rng([*words, number])
+        flips = rng.random((2, count)) < np.array(options.flip)[:, None]
+        keys = jax.random.split(jax.random.fold_in(key, number), count)
+        if self._dumps and rng.random() < options.dumps_share:
+            name, windows = self._read(rng, count)
+        else:
+            name, windows = self._draw(rng, count, VALIDATION_SEEDS if validation else SEEDS)
+        try:
+            return self._prepare(windows, *flips, keys)
+        except ValueError as error:
+            raise InputError(f"windows of {name}: {error}") from error
+
+    def _draw(self, rng: np.random.Generator, count: int, seeds: range) -> tuple[str, Window]:
+        options = self.options
+        shares = np.array(options.weights or [1.0] * len(options.scenes))
+        name = options.scenes[rng.choice(len(options.scenes), p=shares / shares.sum())]
+        worlds = stack_scenes([scene(name, seeds[int(i)]) for i in rng.integers(0, len(seeds), count)])
+        times, steps = (rng.uniform(*bounds, count).astype(np.float32) for bounds in (options.time, options.step))
+        return name, self._render(worlds, times, steps)
+
+    def _read(self, rng: np.random.Generator, count: int) -> tuple[str, Window]:
+        shares = np.array([len(numbers) for _, numbers in self._dumps])
+        sequence, numbers = self._dumps[rng.choice(len(self._dumps), p=shares / shares.sum())]
+        chosen = [numbers[i] for i in rng.integers(0, len(numbers), count)]
+        read = [next(windows_of(sequence, [n], past=self._past, future=self._future)) for n in chosen]
+        return sequence.name, jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *read)
