@@ -53,7 +53,7 @@ def demodulate(
     by: By = "albedo+specular",
     floor: float | Float[Array, ""] = 1e-2,
 ) -> Float[Array, "h w 3"]:
-    """Radiance without the material's texture: color / divisor, the divisor as in `demodulation_divisor`.
+    """Radiance without the material's texture: color / divisor, see `demodulation_divisor`; 0 where that is 0.
 
     What is left varies slowly, so that it can be warped and filtered; `modulate` puts the target's texture back. Where
     light is not reflectance times irradiance (emission, overexposure, fog) the quotient carries a texture that was not
@@ -62,7 +62,7 @@ def demodulate(
     Args:
         color: `[H, W, 3]` linear radiance. gbuffer: with albedo; specular, metallic, sky where they are there.
         by: "albedo+specular", "albedo", or "none" (the colour as it is).
-        floor: the smallest divisor: in the dark it bounds the quotient, and noise.
+        floor: the smallest divisor: in the dark it bounds the quotient, and noise. With 0, what reflects nothing is 0.
 
     Gradient:
         With respect to color, albedo, specular, metallic and (where it holds) floor.
@@ -72,10 +72,14 @@ def demodulate(
 
     References:
         Guo et al. 2021 (ExtraNet), section 4.1; Wu et al. 2023 (ExtraSS), section 4.2. The specular term is the one of
-        ExtraNet's release; its release gives 0 where the albedo is 0, ours floors.
+        ExtraNet's release, which gives 0 where the albedo is 0 (floor=0); ours floors.
     """
     check_gbuffer("gbuffer", gbuffer, size=check_image("color", color, channels=3))
-    return color if by == "none" else color / demodulation_divisor(gbuffer, by=by, floor=floor).astype(color.dtype)
+    if by == "none":
+        return color
+    divisor = demodulation_divisor(gbuffer, by=by, floor=floor).astype(color.dtype)
+    reflects = divisor > 0
+    return jnp.where(reflects, color / jnp.where(reflects, divisor, 1), 0)
 
 
 @partial(jax.jit, static_argnames=("by",))

@@ -49,6 +49,20 @@ def test_demodulate_against_the_formula(by, absent):
         np.testing.assert_allclose(radiance.modulate(result, g, by=by, floor=floor), color, rtol=3e-7)
 
 
+def test_what_reflects_nothing_is_black_without_a_floor():
+    """As the release of ExtraNet: 0 where the albedo is 0, nothing divided by 0, gradients included."""
+    g, color = gbuffer(), jnp.asarray(random(*SIZE, 3, low=0.5))
+    g = replace(g, albedo=g.albedo.at[1:3, 2:4].set(0).at[0, 0, 1].set(0), sky=None)
+    result = np.asarray(radiance.demodulate(color, g, by="albedo", floor=0.0))
+    black = np.asarray(g.albedo) == 0
+    assert (result[black] == 0).all()
+    np.testing.assert_allclose(result[~black], np.asarray(color)[~black] / np.asarray(g.albedo)[~black], rtol=1e-6)
+    gradient = jax.grad(
+        lambda c, a: jnp.sum(radiance.demodulate(c, replace(g, albedo=a), by="albedo", floor=0.0)), (0, 1)
+    )
+    assert all(np.isfinite(v).all() for v in gradient(color, g.albedo))
+
+
 def test_demodulate_by_none():
     color, bare = jnp.asarray(random(*SIZE, 3)), jx.GBuffer()
     np.testing.assert_array_equal(radiance.demodulate(color, bare, by="none"), color)

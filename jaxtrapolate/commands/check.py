@@ -10,11 +10,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from jaxtrapolate.commands.inputs import add_input, open_input, progress
+from jaxtrapolate.commands.inputs import add_input, open_input, open_methods, progress
 from jaxtrapolate.evaluation import arguments, display, held_back, windows
 from jaxtrapolate.files import MotionConvention, Sequence, gaps, prefetch, runs
 from jaxtrapolate.gather import backward_warp
-from jaxtrapolate.methods import load, method_names
+from jaxtrapolate.methods import method_names
 from jaxtrapolate.methods.method import buffer
 from jaxtrapolate.metrics import psnr
 from jaxtrapolate.motion import Sign, Units, YAxis, convert_motion
@@ -172,8 +172,12 @@ def _print_methods(sequence: Sequence, out: Console) -> None:
     table = Table(title="methods")
     for column in ("method", "runs", "left out or missing"):
         table.add_column(column)
+    methods, unavailable = open_methods(method_names())
     for name in method_names():
-        method = load(name)
+        if name in unavailable:
+            table.add_row(name, "no", unavailable[name])
+            continue
+        method = methods[name]
         tries = [(p, held_back(sequence, past=p, future=method.future)) for p in range(method.past, 0, -1)]
         past, numbers = next(((p, n) for p, n in tries if n), (0, []))
         if not numbers:

@@ -6,9 +6,9 @@ from typing import Any
 from rich.console import Console
 
 from jaxtrapolate.commands.evaluate import evaluate
-from jaxtrapolate.commands.inputs import output_folder, parse_size, steps
+from jaxtrapolate.commands.inputs import open_methods, output_folder, parse_size, steps
 from jaxtrapolate.commands.tables import print_table
-from jaxtrapolate.methods import load, method_names
+from jaxtrapolate.methods import method_names
 
 
 def add_parser(subparsers: Any) -> None:
@@ -30,10 +30,10 @@ def run(options: argparse.Namespace) -> None:
 
     folder = output_folder(options.output)
     sequence = SceneSequence("demo", frames=options.frames, size=parse_size(options.size))
-    methods = {name: load(name) for name in method_names()}
+    methods, unavailable = open_methods(method_names())
     console = Console(stderr=True)
     with steps(console) as step:
-        results = evaluate(sequence, methods, folder, step=step)
+        results = evaluate(sequence, methods, folder, unavailable=unavailable, step=step)
     print_table(results, Console())
     console.print(
         f"open {folder / 'report.html'}; numbers in {folder / 'results.json'}", soft_wrap=True, highlight=False

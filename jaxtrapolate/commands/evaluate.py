@@ -16,7 +16,16 @@ from rich.console import Console
 
 from jaxtrapolate import __version__
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.commands.inputs import Step, add_input, named_inputs, open_methods, open_metrics, output_folder, steps
+from jaxtrapolate.commands.inputs import (
+    Step,
+    add_input,
+    add_weights,
+    named_inputs,
+    open_methods,
+    open_metrics,
+    output_folder,
+    steps,
+)
 from jaxtrapolate.commands.kept import Kept, read_json, write_json
 from jaxtrapolate.commands.many import evaluate_many
 from jaxtrapolate.commands.pictures import write_pictures
@@ -40,6 +49,7 @@ from jaxtrapolate.metrics import Metric, metric_names
 from jaxtrapolate.metrics import load as load_metric
 from jaxtrapolate.report import write_report
 from jaxtrapolate.timing import machine
+from jaxtrapolate.weights import fingerprint
 
 
 def add_parser(subparsers: Any) -> None:
@@ -52,6 +62,7 @@ def add_parser(subparsers: Any) -> None:
     )
     add_input(parser, several=True)
     parser.add_argument("--methods", required=True, metavar="A,B,C", help="names of methods, separated by commas")
+    add_weights(parser)
     parser.add_argument("--output", required=True, metavar="DIR", help="for results.json, report.html and pictures")
     parser.add_argument(
         "--metrics",
@@ -68,10 +79,17 @@ def add_parser(subparsers: Any) -> None:
 def run(options: argparse.Namespace) -> int:
     """Runs the command; 2 where some of several inputs could not be used."""
     console, out = Console(stderr=True), Console()
-    methods, metrics = open_methods(options.methods), open_metrics(options.metrics)
+    methods, unavailable = open_methods(options.methods, weights=options.weights)
+    metrics = open_metrics(options.metrics)
     inputs = named_inputs(options.inputs, **{n: getattr(options, n) for n in ("motion", "strict", "size", "length")})
     video = Video.parse(options.video, fps=options.fps, several=len(inputs) > 1)
-    chosen = {"metrics": metrics, "frames": options.frames, "pictures": options.pictures, "video": video}
+    chosen = {
+        "metrics": metrics,
+        "unavailable": unavailable,
+        "frames": options.frames,
+        "pictures": options.pictures,
+        "video": video,
+    }
     if len(inputs) == 1:
         sequence, folder = inputs[0].open(), output_folder(options.output)
         with steps(console) as step:
@@ -94,6 +112,7 @@ def evaluate(
     folder: Path,
     *,
     metrics: dict[str, Metric] | None = None,
+    unavailable: dict[str, str] | None = None,
     frames: str | None = None,
     pictures: int = 2,
     video: Video | None = None,
@@ -103,7 +122,8 @@ def evaluate(
     """Scores methods on a sequence; writes results.json, pictures and report.html to `folder`, and returns the results.
 
     The scores of each frame are kept in `folder/scores` as they come, so that a run that was killed goes on where it
-    was. With `reuse`, results of the same settings that are there already are returned as they are.
+    was. `unavailable` says of methods that were asked for and cannot be had why. With `reuse`, results of the same
+    settings that are there already are returned as they are.
     """
     metrics = {n: load_metric(n) for n in DEFAULT_METRICS} if metrics is None else metrics
     identity = {
@@ -111,7 +131,10 @@ def evaluate(
         "input": sequence.name,
         "motion": str(sequence.convention),
         "size": list(sequence.size),
-        "methods": list(methods),
+        "methods": [*methods, *(unavailable or {})],
+        "weights": {
+            name: fingerprint(method.state) for name, method in methods.items() if jax.tree.leaves(method.state)
+        },
         "metrics": list(metrics),
     }
     settings = identity | {
@@ -122,7 +145,7 @@ def evaluate(
     }
     if reuse and (there := _finished(folder, settings)) is not None:
         return there
-    usable, skipped, left_out = _usable(sequence, methods)
+    usable, skipped, left_out = _usable(sequence, methods, unavailable or {})
     if not usable:
         raise InputError(f"{sequence.name}: no method can run: {'; '.join(f'{n}: {w}' for n, w in skipped.items())}")
     past, future = max(m.past for m in usable.values()), max(m.future for m in usable.values())
@@ -190,9 +213,11 @@ def _finished(folder: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _usable(
-    sequence: Sequence, methods: dict[str, Method]
+    sequence: Sequence, methods: dict[str, Method], unavailable: dict[str, str]
 ) -> tuple[dict[str, Method], dict[str, str], dict[str, dict[str, list[str]]]]:
     """The methods that the sequence has the buffers for, what the others miss, and what stages are left out of each."""
+    if not methods:
+        raise InputError("; ".join(unavailable.values()))
     past, future = max(m.past for m in methods.values()), max(m.future for m in methods.values())
     numbers = held_back(sequence, past=past, future=future)
     if not numbers:
@@ -203,7 +228,7 @@ def _usable(
     window = next(iter(windows(sequence, numbers[:1], past=past, future=future)))
     if window.truth.color is None:
         raise InputError(f"{sequence.name}: frame {window.number} has no colour to compare with; use generate")
-    usable, skipped, left_out = {}, {}, {}
+    usable, skipped, left_out = {}, dict(unavailable), {}
     for name, method in methods.items():
         given = arguments(method, window)
         try:

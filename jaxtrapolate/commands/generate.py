@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from jaxtrapolate import __version__
-from jaxtrapolate.commands.inputs import add_input, open_input, open_methods, output_folder, progress
+from jaxtrapolate.commands.inputs import add_input, add_weights, open_input, open_methods, output_folder, progress
 from jaxtrapolate.files import InputError, Sequence, runs, write_frame
 from jaxtrapolate.files.atomic import atomic_path
 from jaxtrapolate.forecast import forecast
@@ -29,6 +29,7 @@ def add_parser(subparsers: Any) -> None:
     )
     add_input(parser)
     parser.add_argument("--method", required=True, metavar="M", help="name of a method")
+    add_weights(parser)
     parser.add_argument("--output", required=True, metavar="DIR", help="for the frames: EXR for HDR input, else PNG")
     parser.add_argument("--factor", type=int, default=2, metavar="N", help="frame rate out over frame rate in (2)")
     parser.set_defaults(run=run)
@@ -39,7 +40,7 @@ def run(options: argparse.Namespace) -> None:
     console = Console(stderr=True)
     if options.factor < 2:
         raise InputError(f"--factor: expected 2 or more, got {options.factor}")
-    (method,) = _one(open_methods(options.method, option="--method"))
+    method = _one(*open_methods(options.method, option="--method", weights=options.weights))
     sequence = open_input(options.input, motion=options.motion, strict=options.strict)
     folder = output_folder(options.output)
     missing = [n for n in sequence.numbers if not sequence.has_color(n)]
@@ -84,10 +85,12 @@ def run(options: argparse.Namespace) -> None:
     console.print(text, soft_wrap=True, highlight=False)
 
 
-def _one(methods: dict[str, Method]) -> list[Method]:
-    if len(methods) != 1:
-        raise InputError(f"--method: expected one name, got {', '.join(methods)}")
-    return list(methods.values())
+def _one(methods: dict[str, Method], unavailable: dict[str, str]) -> Method:
+    if len(methods) + len(unavailable) != 1:
+        raise InputError(f"--method: expected one name, got {', '.join((*methods, *unavailable))}")
+    for reason in unavailable.values():
+        raise InputError(reason)
+    return next(iter(methods.values()))
 
 
 def _history(sequence: Sequence, number: int, method: Method) -> Frames:

@@ -5,7 +5,7 @@ import contextlib
 import dataclasses
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from rich.console import Console
@@ -152,16 +152,73 @@ def parse_size(text: str) -> tuple[int, int]:
     return int(match[2]), int(match[1])
 
 
-def open_methods(names: str, *, option: str = "--methods") -> dict[str, Method]:
-    """The methods of a comma-separated list; `option` is where it was given."""
-    methods = {}
-    for name in filter(None, (n.strip() for n in names.split(","))):
+def add_weights(parser: argparse.ArgumentParser) -> None:
+    """The argument that names files of weights."""
+    parser.add_argument(
+        "--weights",
+        action="append",
+        default=[],
+        metavar="NAME=FILE",
+        help="a method's weights: a file of this library (.npz), an Orbax checkpoint (a folder), or for extranet the "
+        "authors' .pth.tar; may be given several times",
+    )
+
+
+def parse_weights(texts: list[str]) -> dict[str, str]:
+    """Files of weights by method, from arguments NAME=FILE."""
+    found = {}
+    for text in texts:
+        name, separator, path = text.partition("=")
+        if not separator or not path or name not in method_names():
+            raise InputError(f"--weights: expected NAME=FILE, NAME a method, such as extranet=FILE, got {text!r}")
+        found[name] = path
+    return found
+
+
+def open_method(name: str, weights: str | None) -> Method:
+    """A method with the weights in a file; with `None`, those that come with the package.
+
+    Raises:
+        InputError: the file cannot be used.
+        ValueError: no weights of this method come with the package.
+    """
+    if weights is None:
+        return load(name)
+    try:
+        return load(name, weights=weights)
+    except OSError as error:
+        raise os_input_error(weights, error) from error
+    except ValueError as error:
+        raise InputError(f"--weights {name}: {error}") from error
+
+
+def open_methods(
+    names: str | Iterable[str], *, option: str = "--methods", weights: list[str] | None = None
+) -> tuple[dict[str, Method], dict[str, str]]:
+    """Methods by name, of a comma-separated list; and of those that have no weights, why they cannot be had.
+
+    Args:
+        names: the list. option: where it was given.
+        weights: arguments NAME=FILE.
+
+    Raises:
+        InputError: an unknown name, none at all, or weights that cannot be used or belong to a method not named.
+    """
+    listed = [n.strip() for n in names.split(",")] if isinstance(names, str) else list(names)
+    files = parse_weights(weights or [])
+    methods, unavailable = {}, {}
+    for name in filter(None, listed):
         if name not in method_names():
             raise InputError(f"{option}: no method {name!r}; there are {', '.join(method_names())}")
-        methods[name] = load(name)
-    if not methods:
+        try:
+            methods[name] = open_method(name, files.pop(name, None))
+        except ValueError as error:
+            unavailable[name] = str(error)
+    if not methods and not unavailable:
         raise InputError(f"{option}: expected names separated by commas, of {', '.join(method_names())}")
-    return methods
+    if files:
+        raise InputError(f"--weights: {', '.join(files)} is not among the methods of {option}")
+    return methods, unavailable
 
 
 def open_metrics(names: str) -> dict[str, Metric]:

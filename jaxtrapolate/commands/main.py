@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 
 from jaxtrapolate import __version__
-from jaxtrapolate.commands import check, demo, evaluate, generate, render, scenes, train
+from jaxtrapolate.commands import check, demo, evaluate, generate, import_weights, render, scenes, train
 from jaxtrapolate.files import InputError
 
 
@@ -17,7 +17,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"jaxtrapolate {__version__}")
     subparsers = top.add_subparsers(required=True, metavar="COMMAND")
-    for command in (demo, check, generate, evaluate, render, scenes, train):
+    for command in (demo, check, generate, evaluate, render, scenes, train, import_weights):
         command.add_parser(subparsers)
     return top
 

@@ -3,9 +3,10 @@
 from collections.abc import Callable
 from os import PathLike
 
-from jaxtrapolate.methods import bidirectional, blending, grids, opticalflow, reprojection, warping
+from jaxtrapolate.methods import bidirectional, blending, extranet, grids, opticalflow, reprojection, warping
 from jaxtrapolate.methods.method import Method as Method
 from jaxtrapolate.methods.method import Stage as Stage
+from jaxtrapolate.weights import default_weights
 
 _METHODS: dict[str, Callable[[], Method]] = {
     "repeat": warping.repeat,
@@ -26,26 +27,35 @@ _METHODS: dict[str, Callable[[], Method]] = {
 }
 
 
+_NETWORKS: dict[str, Callable[[str | PathLike[str]], Method]] = {"extranet": extranet.load}
+"""Methods with weights, each made from a file of them."""
+
+
 def method_names() -> tuple[str, ...]:
-    """The names that `load` knows."""
-    return tuple(_METHODS)
+    """The names that `load` knows; some need a file of weights."""
+    return (*_METHODS, *_NETWORKS)
 
 
-def load(name: str, *, weights: str | PathLike = "default") -> Method:
+def load(name: str, *, weights: str | PathLike[str] = "default") -> Method:
     """A method by name.
 
     Args:
         name: one of `method_names()`.
-        weights: "default", or a file of weights, for methods that have any.
+        weights: for methods that have any: "default", those that come with the package; a file of weights of this
+            library (`.npz`); an Orbax checkpoint (a folder); for "extranet" also the authors' `.pth.tar`.
 
     Returns:
         A `Method`: `image = method(history, target, future=())`.
 
     Raises:
-        ValueError: an unknown name, or weights for a method that has none.
+        OSError: the file of weights cannot be read.
+        ValueError: an unknown name, weights for a method that has none, a method without default weights, or a file
+            that holds none of that method.
     """
-    if name not in _METHODS:
-        raise ValueError(f"method: expected one of {', '.join(_METHODS)}, got {name!r}")
-    if weights != "default":
-        raise ValueError(f"weights: method {name!r} has none, got {str(weights)!r}")
-    return _METHODS[name]()
+    if name in _METHODS:
+        if weights != "default":
+            raise ValueError(f"weights: method {name!r} has none, got {str(weights)!r}")
+        return _METHODS[name]()
+    if name not in _NETWORKS:
+        raise ValueError(f"method: expected one of {', '.join(method_names())}, got {name!r}")
+    return _NETWORKS[name](default_weights(name) if weights == "default" else weights)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxtrapolate.checks import check_choice, missing_package
+from jaxtrapolate.checks import missing_package
 from jaxtrapolate.records import Frame, check_frame
 
 Values = Mapping[str, Any]
@@ -89,6 +89,7 @@ class Method:
         past, future: how many rendered frames it takes at most; with fewer it leaves out what needs them.
         scale: output size over input size.
         state: a pytree, the weights.
+        networks: the networks on their own, by name: pure functions `(state, *inputs) -> output` of one frame.
         start: `(history, target) -> carry`, for methods with memory.
     """
 
@@ -99,6 +100,7 @@ class Method:
     future: int = 0
     scale: int = 1
     state: Any = ()
+    networks: Mapping[str, Callable[..., Any]] = dataclasses.field(default_factory=dict)
     start: Callable[[Frames, Frame], Any] | None = None
 
     def missing(self, history: Frames, target: Frame, future: Frames = ()) -> dict[str, list[str]]:
@@ -119,19 +121,6 @@ class Method:
             elif not stage.optional:
                 raise ValueError(f"method {self.name!r}, stage {stage.name!r}: missing {', '.join(lacks)}")
         return tuple(stages)
-
-    def before(self, stage: str, history: Frames, target: Frame, future: Frames = ()) -> dict[str, Any]:
-        """The values that the stages before the one named `stage` make, without a carry: what training prepares.
-
-        Raises:
-            ValueError: see `active`; or no stage of that name runs on frames like these.
-        """
-        self._check(history, target, future)
-        stages = self.active(history, target, future)
-        names = [s.name for s in stages]
-        check_choice("stage", stage, names)
-        values = {"carry": (), "history": history, "target": target, "future": future}
-        return values | _run(stages[: names.index(stage)], self.state, values)
 
     def _lacks(self, stage: Stage, history: Frames, target: Frame, future: Frames) -> list[str]:
         sources = [history[i] for i in rendered(history)][: self.past]
@@ -160,15 +149,37 @@ class Method:
         self._check(history, target, future)
         if target.color is not None and self.scale == 1:
             return carry, jnp.asarray(target.color)
+        values = self._advance(self.active(history, target, future), state, carry, history, target, future)
+        return values["carry"], values["image"]
+
+    def values_before(
+        self, stage: str, state: Any, carry: Any, history: Frames, target: Frame, future: Frames = ()
+    ) -> dict[str, Any]:
+        """The values that a stage gets: what the stages before it have made, as a pure function like `function`.
+
+        Training runs a network's inputs through it, under vmap and jit: `values_before("network", ...)["inputs"]`.
+        The target's colour is not looked at.
+
+        Raises:
+            TypeError, ValueError: as `function`; no stage of that name, or one that these frames leave out.
+        """
+        self._check(history, target, future)
+        stages = self.active(history, target, future)
+        names = [s.name for s in stages]
+        if stage not in names:
+            raise ValueError(f"method {self.name!r}: expected one of the stages {', '.join(names)}, got {stage!r}")
+        return self._advance(stages[: names.index(stage)], state, carry, history, target, future)
+
+    def _advance(self, stages, state, carry, history, target, future) -> dict[str, Any]:
         values = {"carry": carry, "history": history, "target": target, "future": future}
-        for stage in self.active(history, target, future):
+        for stage in stages:
             if stage.host and any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state, values))):
                 raise TypeError(
                     f"method {self.name!r}, stage {stage.name!r}: runs on the host, where nothing can be traced; "
                     "call the method or its step outside of jit, grad and vmap"
                 )
             values |= stage.function(state, values)
-        return values["carry"], values["image"]
+        return values
 
     def _by_turns(self, carry, history, target, future):
         """As `function`, each row of stages between those on the host compiled as one."""
@@ -204,6 +215,18 @@ class Method:
     @cached_property
     def _jitted(self):
         return jax.jit(self.function)
+
+    @cached_property
+    def network(self) -> Callable[..., Any]:
+        """The bare network with the method's weights, compiled: `(*inputs) -> output` of one frame.
+
+        Raises:
+            ValueError: the method has none, or several: `networks` has them by name.
+        """
+        if len(self.networks) != 1:
+            raise ValueError(f"method {self.name!r}: expected one network, it has {', '.join(self.networks) or 'none'}")
+        (function,) = self.networks.values()
+        return partial(jax.jit(function), self.state)
 
     @cached_property
     def jitted_stages(self) -> dict[str, Callable[[Any, Values], dict[str, Any]]]:

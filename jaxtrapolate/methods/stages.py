@@ -1,28 +1,34 @@
 """Stages that several methods share.
 
-Values they pass on: "motion", from the target to the newest rendered frame, which is "newest"; "holes", a bool mask;
-"plain_share", where the colour as it is should be preferred, from `jaxtrapolate.methods.hindsight`; "layer", the image
-that is to be warped: the demodulated colour where that can be, followed by the colour as it is where "plain_share" asks
-for both; "warped", the same after warping; "image".
+Values they pass on: "sources", the rendered frames that are warped, newest first, and "motions", from the target to
+each of them; "newest" and "motion", the first of both. "masks", bool, for each source where it shows something else,
+and "holes", the first of them. "plain_share", where the colour as it is should be preferred, from
+`jaxtrapolate.methods.hindsight`. "layers", for each source the image that is to be warped: the demodulated colour where
+that can be, followed by the colour as it is where "plain_share" asks for both. "occlusion_motion". "warped", what was
+made of the layers for the target, and "image".
 """
 
 from collections.abc import Sequence
+from typing import Literal
 
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.gather import backward_warp
-from jaxtrapolate.holes import hole_masks
+from jaxtrapolate.holes import Taps, hole_masks
 from jaxtrapolate.methods.method import Stage, Values, rendered
-from jaxtrapolate.motion import chain_motion
+from jaxtrapolate.motion import chain_motion, occlusion_motion
 from jaxtrapolate.radiance import By, demodulate, modulate
-from jaxtrapolate.records import Frame, GBuffer
+from jaxtrapolate.records import Frame, GBuffer, replace
 
 
-def chain(frames: Sequence[Frame], first: int, last: int) -> Array:
-    """Motion from frames[first] to the older frames[last], through the motion of all frames between."""
-    total = None
+def chain(frames: Sequence[Frame], first: int, last: int, *, before: Array | None = None) -> Array:
+    """Motion from frames[first] to the older frames[last], through the motion of all frames between.
+
+    With `before`, the motion from some frame to frames[first], it is the motion from that frame.
+    """
+    total = before
     for i in range(first, last, -1):
         name = f"frame {i - len(frames) + 1} before the target: motion"
         motion = check_present(name, frames[i].motion, needed_by="the chain of motion")
@@ -30,41 +36,65 @@ def chain(frames: Sequence[Frame], first: int, last: int) -> Array:
     return check_present(f"motion from frame {first} to the older frame {last}", total, needed_by="the warp")
 
 
-def _reproject(state, values: Values):
-    history, target = values["history"], values["target"]
-    newest = rendered(history)[0]
-    return {"newest": history[newest], "motion": chain((*history, target), len(history), newest)}
+def reproject_stage(past: int = 1) -> Stage:
+    """Finds the newest `past` rendered frames and the motion that leads to each, as far back as motion vectors go."""
+
+    def function(state, values: Values):
+        history, target = values["history"], values["target"]
+        frames, place, motion, sources, motions = (*history, target), len(history), None, [], []
+        for older in rendered(history)[:past]:
+            if sources and any(frame.motion is None for frame in frames[older + 1 : place + 1]):
+                break
+            motion, place = chain(frames, place, older, before=motion), older
+            sources.append(history[older])
+            motions.append(motion)
+        return {"newest": sources[0], "motion": motions[0], "sources": tuple(sources), "motions": tuple(motions)}
+
+    return Stage("reproject", function, reads=("target.motion", "history.color"))
 
 
-REPROJECT = Stage("reproject", _reproject, reads=("target.motion", "history.color"))
+REPROJECT = reproject_stage()
 """Finds the newest rendered frame and the motion that leads there."""
 
 
-def demodulate_stage(by: By = "albedo+specular") -> Stage:
-    """Divides the newest frame by its reflectance; without albedo the colour is warped as it is."""
+def _demodulated(gbuffer: GBuffer | None, sky: bool) -> GBuffer:
+    """The G-buffer as demodulation sees it."""
+    gbuffer = check_present("gbuffer", gbuffer, needed_by="demodulation")
+    return gbuffer if sky else replace(gbuffer, sky=None)
+
+
+def demodulate_stage(by: By = "albedo+specular", *, floor: float = 1e-2, sky: bool = True) -> Stage:
+    """Divides the sources by their reflectance; without albedo the colour is warped as it is.
+
+    Args:
+        by, floor: as of `demodulate`.
+        sky: whether the colour of the sky stays as it is; else its albedo counts.
+    """
 
     def function(state, values: Values):
-        newest = values["newest"]
-        irradiance = demodulate(newest.color, newest.gbuffer, by=by)
-        both = "plain_share" in values
-        return {"layer": jnp.concatenate([irradiance, newest.color], -1) if both else irradiance}
+        layers = []
+        for source in values["sources"]:
+            irradiance = demodulate(source.color, _demodulated(source.gbuffer, sky), by=by, floor=floor)
+            both = "plain_share" in values
+            layers.append(jnp.concatenate([irradiance, source.color], -1) if both else irradiance)
+        return {"layers": tuple(layers)}
 
     return Stage("demodulate", function, reads=("history.albedo", "target.albedo"), optional=True)
 
 
-def layer(values: Values) -> Array:
-    """What is to be warped: the demodulated colour, or the colour where that stage was left out."""
-    return values["layer"] if "layer" in values else values["newest"].color
+def layers(values: Values) -> tuple[Array, ...]:
+    """What is to be warped: the demodulated colours, or the colours where that stage was left out."""
+    return values["layers"] if "layers" in values else tuple(source.color for source in values["sources"])
 
 
-def modulate_stage(by: By = "albedo+specular") -> Stage:
+def modulate_stage(by: By = "albedo+specular", *, floor: float = 1e-2, sky: bool = True) -> Stage:
     """Multiplies by the target's reflectance, and mixes in the colour that was warped as it is, by "plain_share".
 
-    That colour is the plain warp's outside holes, and in holes the method's own.
+    That colour is the plain warp's outside holes, and in holes the method's own. Options as of `demodulate_stage`.
     """
 
     def function(state, values: Values):
-        image = modulate(values["warped"][..., :3], values["target"].gbuffer, by=by)
+        image = modulate(values["warped"][..., :3], _demodulated(values["target"].gbuffer, sky), by=by, floor=floor)
         if "plain_share" in values:
             plain = backward_warp(values["newest"].color, values["motion"])
             plain = jnp.where(values["holes"], values["warped"][..., 3:], plain)
@@ -83,17 +113,47 @@ SKY = Stage("sky", _sky, reads=("target.sky", "target.sky_color"), optional=True
 """Takes the sky as the engine drew it for the target."""
 
 
-def find_holes(target: GBuffer | None, source: GBuffer | None, motion: Array) -> Array:
+def _occlusion(state, values: Values):
+    return {"occlusion_motion": occlusion_motion(values["motion"], values["target"].gbuffer.depth)}
+
+
+OCCLUSION = Stage("occlusion motion", _occlusion, reads=("target.depth",))
+"""The motion of what hid the holes."""
+
+
+def composite(
+    values: Values, image: Float[Array, "h w c"], *, outside: Literal["edge", "zero"] = "edge"
+) -> Float[Array, "h w c"]:
+    """An image of the newest source along the motion, in holes along the occluder's where that is known.
+
+    Guo et al. 2021 (ExtraNet), section 4.2.
+    """
+    motion, occluder = values["motion"], values.get("occlusion_motion")
+    along = motion if occluder is None else jnp.where(values["holes"], occluder, motion)
+    return backward_warp(image, along, outside=outside)
+
+
+def find_holes(
+    target: GBuffer | None, source: GBuffer | None, motion: Array, *, taps: Taps = "nearest", **options
+) -> Array:
     """The union `[H, W, 1]` of all hole masks that the buffers allow, by the pixel nearest to the landing place.
 
-    Judged by all four bilinear taps, every pixel beside a silhouette would be a hole as well.
+    Judged by all four bilinear taps, every pixel beside a silhouette would be a hole as well. Options as of
+    `hole_masks`.
     """
-    return hole_masks(target or GBuffer(), source or GBuffer(), motion, taps="nearest").any
+    return hole_masks(target or GBuffer(), source or GBuffer(), motion, taps=taps, **options).any
 
 
-def _holes(state, values: Values):
-    return {"holes": find_holes(values["target"].gbuffer, values["newest"].gbuffer, values["motion"])}
+def holes_stage(taps: Taps = "nearest", **options) -> Stage:
+    """Marks where each source shows another surface; with no buffers at all, only what lies outside the frame."""
+
+    def function(state, values: Values):
+        buffers, pairs = values["target"].gbuffer, zip(values["sources"], values["motions"], strict=True)
+        masks = tuple(find_holes(buffers, source.gbuffer, motion, taps=taps, **options) for source, motion in pairs)
+        return {"holes": masks[0], "masks": masks}
+
+    return Stage("holes", function)
 
 
-HOLES = Stage("holes", _holes)
-"""Marks where the warped frame shows another surface; with no buffers at all, only what lies outside the frame."""
+HOLES = holes_stage()
+"""Marks where the warped frame shows another surface."""

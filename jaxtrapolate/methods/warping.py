@@ -6,8 +6,16 @@ from jaxtrapolate.gather import backward_warp
 from jaxtrapolate.guided import guided_warp
 from jaxtrapolate.methods.hindsight import hindsight_stage
 from jaxtrapolate.methods.method import Method, Stage, Values, rendered
-from jaxtrapolate.methods.stages import HOLES, REPROJECT, SKY, demodulate_stage, layer, modulate_stage
-from jaxtrapolate.motion import occlusion_motion
+from jaxtrapolate.methods.stages import (
+    HOLES,
+    OCCLUSION,
+    REPROJECT,
+    SKY,
+    composite,
+    demodulate_stage,
+    layers,
+    modulate_stage,
+)
 
 
 def repeat() -> Method:
@@ -32,22 +40,17 @@ def warp() -> Method:
 def occlusion_warp() -> Method:
     """The demodulated frame along the motion, in holes along the occluder's (the occlusion composite of ExtraNet)."""
 
-    def occlusion(state, values: Values):
-        return {"occlusion_motion": occlusion_motion(values["motion"], values["target"].gbuffer.depth)}
-
-    def composite(state, values: Values):
-        image = layer(values)
-        along = jnp.where(values["holes"], values["occlusion_motion"], values["motion"])
-        warped = backward_warp(image, along)
+    def function(state, values: Values):
+        warped = composite(values, layers(values)[0])
         return {"warped": warped, "image": warped[..., :3]}
 
     stages = (
         REPROJECT,
-        Stage("occlusion motion", occlusion, reads=("target.depth",)),
+        OCCLUSION,
         HOLES,
         hindsight_stage(),
         demodulate_stage(),
-        Stage("composite", composite),
+        Stage("composite", function),
         modulate_stage(),
         SKY,
     )
@@ -63,22 +66,21 @@ def guides(target, source):
     return tuple(jnp.concatenate([getattr(g, n) for n in names], -1) for g in (target, source))
 
 
+def _guided(state, values: Values):
+    target_guide, source_guide = guides(values["target"].gbuffer, values["newest"].gbuffer)
+    warped = guided_warp(layers(values)[0], values["motion"], target_guide, source_guide)
+    return {"warped": warped, "image": warped[..., :3]}
+
+
+GUIDED = Stage(
+    "guided warp",
+    _guided,
+    reads=tuple("|".join(f"{role}.{name}" for name in (*_GUIDES, "stencil")) for role in ("target", "history")),
+)
+"""Fetches the newest layer from the most similar pixels around where the motion leads."""
+
+
 def guided() -> Method:
     """The demodulated frame fetched from the most similar pixels around where the motion leads (ExtraSS)."""
-
-    def function(state, values: Values):
-        target_guide, source_guide = guides(values["target"].gbuffer, values["newest"].gbuffer)
-        warped = guided_warp(layer(values), values["motion"], target_guide, source_guide)
-        return {"warped": warped, "image": warped[..., :3]}
-
-    reads = tuple("|".join(f"{role}.{n}" for n in (*_GUIDES, "stencil")) for role in ("target", "history"))
-    stages = (
-        REPROJECT,
-        HOLES,
-        hindsight_stage(),
-        demodulate_stage(),
-        Stage("guided warp", function, reads=reads),
-        modulate_stage(),
-        SKY,
-    )
+    stages = (REPROJECT, HOLES, hindsight_stage(), demodulate_stage(), GUIDED, modulate_stage(), SKY)
     return Method("guided_warp", stages, past=2)

@@ -9,5 +9,6 @@ from jaxtrapolate.weights.files import load_orbax as load_orbax
 from jaxtrapolate.weights.files import load_weights as load_weights
 from jaxtrapolate.weights.files import save_weights as save_weights
 from jaxtrapolate.weights.pytorch import read_torch as read_torch
+from jaxtrapolate.weights.tree import configured as configured
 from jaxtrapolate.weights.tree import fingerprint as fingerprint
 from jaxtrapolate.weights.tree import fit as fit

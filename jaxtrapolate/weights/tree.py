@@ -1,5 +1,6 @@
 """Weights as a tree of arrays and as arrays by name, "path/of/param"."""
 
+import dataclasses
 import hashlib
 from collections.abc import Mapping
 from typing import Any, TypeVar
@@ -8,6 +9,7 @@ import jax
 import numpy as np
 
 T = TypeVar("T")
+C = TypeVar("C")
 
 
 def named(tree: Any) -> dict[str, Any]:
@@ -86,3 +88,18 @@ def fingerprint(tree: Any) -> str:
 
 def _listed(names: list[str]) -> str:
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+
+
+def configured(kind: type[C], stated: Mapping[str, Any], *, source: str) -> C:
+    """A dataclass from what JSON says about it: lists become tuples, what is not said has its default.
+
+    Raises:
+        ValueError: one line that names `source` and an entry that the configuration does not have or take.
+    """
+    known = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    if unknown := [name for name in stated if name not in known]:
+        raise ValueError(f"{source}: {kind.__name__} has no {', '.join(unknown)}; a newer version may have")
+    try:
+        return kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in stated.items()})
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{source}: {kind.__name__}: {error}") from error

@@ -1,0 +1,268 @@
+"""ExtraNet as a method (Guo et al. 2021): three warped rendered frames and the target's buffers, shaded by a network.
+
+Histories are warped demodulated, holes are marked, and the network answers in the log domain. What it is shown is its
+`Preparation`, which is a part of its weights: the authors' network needs `RELEASE`, as their release prepares it.
+"""
+
+import dataclasses
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Float
+
+from jaxtrapolate.checks import check_choice
+from jaxtrapolate.gather import backward_warp
+from jaxtrapolate.holes import Taps
+from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.stages import (
+    OCCLUSION,
+    SKY,
+    composite,
+    demodulate_stage,
+    holes_stage,
+    layers,
+    modulate_stage,
+    reproject_stage,
+)
+from jaxtrapolate.methods.warping import GUIDED
+from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig, from_torch
+from jaxtrapolate.networks.inference import inference
+from jaxtrapolate.radiance import By, log_decode, log_encode
+from jaxtrapolate.records import GBuffer
+from jaxtrapolate.weights import configured, fit, load_orbax, load_weights, read_torch, save_weights
+
+_NAME = "extranet"
+
+
+@dataclasses.dataclass(frozen=True)
+class Preparation:
+    """How a frame is prepared for the network; the defaults are ours, which need no unit of length.
+
+    Attributes:
+        first_guess: x's first three channels, which the network corrects: the newest frame by the "warp" along the
+            motion, or by the "guided" warp (albedo and normals, else the stencil; without any, the warp).
+        by, floor: of `demodulate`; with floor 0 what reflects nothing is 0.
+        sky: whether the sky's colour is fed as it is; else demodulated like the rest, by the albedo stored there.
+        outside: what a warp fetches beyond the frame.
+        taps, position_threshold: of `hole_masks`.
+        depth: "relative" is m / (m + depth), m the harmonic mean over the frame: 1/2 there, 0 at the sky. "minmax" is
+            the release's: depth in centimetres, what is beyond 10 km 0, min and max over the frame to 0 and 1.
+        sky_normal: what is fed, in each channel, for the normal of the sky.
+    """
+
+    first_guess: Literal["warp", "guided"] = "warp"
+    by: By = "albedo+specular"
+    floor: float = 1e-2
+    sky: bool = True
+    outside: Literal["edge", "zero"] = "edge"
+    taps: Taps = "nearest"
+    position_threshold: tuple[float, float, float] | None = None
+    depth: Literal["relative", "minmax"] = "relative"
+    sky_normal: float = 0.0
+
+    def __post_init__(self):
+        for name, choices in _CHOICES.items():
+            check_choice(name, getattr(self, name), choices)
+        if not 0 <= self.floor < float("inf"):
+            raise ValueError(f"floor: expected 0 or more, got {self.floor!r}")
+
+
+_CHOICES = {
+    "first_guess": ("warp", "guided"),
+    "by": get_args(By),
+    "outside": ("edge", "zero"),
+    "taps": get_args(Taps),
+    "depth": ("relative", "minmax"),
+}
+
+RELEASE = Preparation(
+    by="albedo",
+    floor=0.0,
+    sky=False,
+    outside="zero",
+    position_threshold=(7.5, 45.0, 0.005),
+    depth="minmax",
+    sky_normal=-1.0,
+)
+"""What the authors' weights were trained on: lengths in centimetres, sky normals (-1, -1, -1), and no floor.
+
+Departure: holes are judged by the nearest pixel, not by four taps with or without weight, which is 0.15 dB better on a
+path-traced clip.
+"""
+
+
+def relative_depth(depth: Float[Array, "h w 1"], sky: Float[Array, "h w 1"] | None) -> Float[Array, "h w 1"]:
+    """m / (m + depth), m the harmonic mean of what is no sky: in 0..1, without a unit; 0 at the sky.
+
+    Depth that is not positive or not finite counts as sky. The gradient is finite everywhere.
+    """
+    known = (depth > 0) & jnp.isfinite(depth)
+    if sky is not None:
+        known &= sky < 0.5
+    nearness = jnp.where(known, 1 / jnp.where(known, depth, 1), 0)
+    total, count = jnp.sum(nearness), jnp.sum(known.astype(depth.dtype))
+    mean = total / jnp.where(count > 0, count, 1)
+    whole = jnp.where(known, nearness + mean, 1)
+    return nearness / whole
+
+
+def minmax_depth(depth: Float[Array, "h w 1"]) -> Float[Array, "h w 1"]:
+    """The release's depth: in units of 100 m, 0 where over 100 of them, then (d - min) / (max - min + 1e-6)."""
+    hundreds = depth * 1e-4
+    known = hundreds <= 100
+    hundreds = jnp.where(known, hundreds, 0)
+    low, high = jnp.min(hundreds), jnp.max(hundreds)
+    return (hundreds - low) / (high - low + 1e-6)
+
+
+def features(buffers: GBuffer | None, like: Float[Array, "h w c"], preparation: Preparation) -> Float[Array, "h w 6"]:
+    """What the network is shown of the target `[H, W, 6]`: world normal, depth, roughness, metallic.
+
+    Zeros for what is not there; size and dtype are those of `like`.
+    """
+    buffers = buffers or GBuffer()
+    nothing = jnp.zeros((*like.shape[:2], 1), like.dtype)
+    normal = jnp.repeat(nothing, 3, -1) if buffers.normal is None else jnp.asarray(buffers.normal, like.dtype)
+    if buffers.sky is not None and buffers.normal is not None:
+        normal = jnp.where(buffers.sky > 0.5, preparation.sky_normal, normal)
+    depth = nothing
+    if buffers.depth is not None:
+        given = jnp.asarray(buffers.depth, like.dtype)
+        depth = minmax_depth(given) if preparation.depth == "minmax" else relative_depth(given, buffers.sky)
+    rest = (nothing if v is None else jnp.asarray(v, like.dtype) for v in (buffers.roughness, buffers.metallic))
+    return jnp.concatenate([normal, depth, *rest], -1)
+
+
+def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
+    def encode(image):
+        """log(1 + r) in at least float32; what is not finite counts as 0."""
+        image = image.astype(jnp.promote_types(image.dtype, jnp.float32))
+        return log_encode(jnp.where(jnp.isfinite(image), image, 0))
+
+    def function(state, values: Values):
+        warped = [encode(image) for image in values["histories"]]
+        first = encode(values["warped"])
+        valid = [1 - mask.astype(first.dtype) for mask in values["masks"]]
+        guesses = [first, encode(composite(values, layers(values)[0], outside=preparation.outside))]
+        sources = [jnp.concatenate(pair, -1) for pair in zip(warped, valid, strict=True)]
+        sources = [sources[min(k, len(sources) - 1)] for k in range(config.histories)]
+        inputs = {
+            "x": jnp.concatenate(guesses[: config.warps], -1),
+            "mask": valid[0],
+            "features": features(values["target"].gbuffer, first, preparation) if config.features else None,
+            "history": jnp.stack(sources[::-1]) if sources else None,
+        }
+        return {"inputs": inputs}
+
+    return Stage("inputs", function)
+
+
+def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Method:
+    """The method with a network's weights.
+
+    The three newest rendered frames are warped to the target, demodulated, and with masks; where fewer can be had the
+    oldest is repeated. The network sees x `[H, W, 6]` (the first guess and the occlusion composite), mask `[H, W, 1]`,
+    features `[H, W, 6]` and history `[3, H, W, 4]`, oldest first, all in the log domain: these are `values["inputs"]`
+    of the stages before "network". Its answer is decoded and modulated. The sky is the engine's where it draws it
+    apart, else that of the newest frame, warped.
+
+    What a scene lacks is left out: no albedo, no demodulation; no depth, no occlusion motion, the composite is the
+    warp; normal, depth, roughness or metallic that are absent are zeros; masks are those that the buffers allow.
+
+    Args:
+        model: its batch norms are used as in evaluation.
+        preparation: what the model was trained on.
+
+    Raises:
+        ValueError: a model with other features than these 6 or none, or with more warped images than these two.
+
+    References:
+        Guo et al. 2021 (ExtraNet), sections 4 and 5.2, and the authors' release. Departures: motion is chained with
+        interpolation and is not dilated; the sky is not taken from the target's own colour.
+    """
+    config = model.config
+    if config.features not in (0, 6) or not 1 <= config.warps <= 2:
+        raise ValueError(f"model: expected 6 features or none and 1 or 2 warped images, got {config}")
+    function, state = inference(model)
+
+    def warp(state, values: Values):
+        pairs = zip(layers(values), values["motions"], strict=True)
+        warped = tuple(backward_warp(image, motion, outside=preparation.outside) for image, motion in pairs)
+        return {"histories": warped, "warped": warped[0]}
+
+    def network(state, values: Values):
+        inputs = values["inputs"]
+        image = log_decode(function(state, *(inputs[name] for name in ("x", "mask", "features", "history"))))
+        return {"warped": image, "image": image}
+
+    def sky(state, values: Values):
+        plain = composite(values, values["newest"].color)
+        return {"image": jnp.where(values["target"].gbuffer.sky > 0.5, plain, values["image"])}
+
+    demodulation: dict[str, Any] = {"floor": preparation.floor, "sky": preparation.sky}
+    guided = (dataclasses.replace(GUIDED, optional=True),) if preparation.first_guess == "guided" else ()
+    past = max(1, config.histories)
+    stages = (
+        reproject_stage(past),
+        dataclasses.replace(OCCLUSION, optional=True),
+        holes_stage(preparation.taps, position_threshold=preparation.position_threshold),
+        demodulate_stage(preparation.by, **demodulation),
+        Stage("warp", warp),
+        *guided,
+        _inputs_stage(config, preparation),
+        Stage("network", network),
+        modulate_stage(preparation.by, **demodulation),
+        Stage("warped sky", sky, reads=("target.sky",), optional=True),
+        SKY,
+    )
+    return Method(_NAME, stages, past=past, state=state, networks={"network": function})
+
+
+def load_extranet(path: str | PathLike[str]) -> tuple[ExtraNet, Preparation]:
+    """A network and its preparation, from a file of this library, an Orbax checkpoint, or the authors' `.pth.tar`.
+
+    Args:
+        path: what ends in `.npz` is read by `load_weights`, a folder by `load_orbax`, all else by `read_torch`.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: one line that names the file: damaged, of another method, or with weights that do not fit.
+    """
+    path = Path(path)
+    if path.suffix != ".npz" and not path.is_dir():
+        checkpoint = read_torch(path)
+        try:
+            return from_torch(checkpoint.get("state_dict", checkpoint)), RELEASE
+        except ValueError as error:
+            raise ValueError(f"{path}: no weights of ExtraNet: {error}") from error
+    weights = load_orbax(path) if path.is_dir() else load_weights(path)
+    if weights.method not in (_NAME, None):
+        raise ValueError(f"{path}: weights of method {weights.method!r}, expected {_NAME!r}")
+    config = configured(ExtraNetConfig, weights.config.get("network", {}), source=str(path))
+    preparation = configured(Preparation, weights.config.get("preparation", {}), source=str(path))
+    structure, state = nnx.split(nnx.eval_shape(lambda: ExtraNet(config, rngs=nnx.Rngs(0))))
+    fitted = fit(nnx.to_pure_dict(state), weights.tree, source=str(path))
+    nnx.replace_by_pure_dict(state, fitted)
+    return nnx.merge(structure, state), preparation
+
+
+def extranet_config(config: ExtraNetConfig, preparation: Preparation) -> dict[str, Any]:
+    """What a file of weights states about them, as `load_extranet` reads it."""
+    return {"network": dataclasses.asdict(config), "preparation": dataclasses.asdict(preparation)}
+
+
+def save_extranet(
+    directory: str | PathLike[str], model: ExtraNet, *, preparation: Preparation, note: str, name: str | None = None
+) -> Path:
+    """Writes a network and its preparation to a file that `load_extranet` reads; see `save_weights`."""
+    tree, config = nnx.to_pure_dict(nnx.state(model)), extranet_config(model.config, preparation)
+    return save_weights(directory, _NAME, tree, config=config, note=note, name=name)
+
+
+def load(path: str | PathLike[str]) -> Method:
+    """The method with the weights in a file; see `load_extranet`."""
+    model, preparation = load_extranet(path)
+    return extranet(model, preparation=preparation)
