@@ -223,6 +223,17 @@ def test_the_answer_is_decoded_and_modulated(methods):
         np.testing.assert_allclose(image_of(method, history, target)[solid], expected[solid], rtol=2e-4, atol=2e-4)
 
 
+@pytest.mark.parametrize("preparation", [OURS, RELEASE], ids=["ours", "release"])
+def test_the_truth_is_encoded_as_the_answer_is_decoded(preparation):
+    history, _ = make_window()
+    color, buffers = jnp.abs(history[-1].color), history[-1].gbuffer
+    found = np.float64(module.encoded_truth(color, buffers, preparation=preparation))
+    below = divisor(buffers, preparation is RELEASE)
+    np.testing.assert_allclose(np.expm1(found) * below, np.where(below > 0, color, 0), rtol=2e-5, atol=1e-5)
+    plain = module.encoded_truth(color, replace(buffers, albedo=None), preparation=preparation)
+    np.testing.assert_allclose(plain, np.log1p(color), rtol=1e-6)
+
+
 def test_the_sky_is_the_engines_or_the_warped_one(methods):
     history, target = make_window()
     sky = target.gbuffer.sky[..., 0] > 0.5

@@ -22,6 +22,7 @@ from jaxtrapolate.methods.stages import (
     SKY,
     composite,
     demodulate_stage,
+    demodulated,
     holes_stage,
     layers,
     modulate_stage,
@@ -30,7 +31,7 @@ from jaxtrapolate.methods.stages import (
 from jaxtrapolate.methods.warping import GUIDED
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig, from_torch
 from jaxtrapolate.networks.inference import inference
-from jaxtrapolate.radiance import By, log_decode, log_encode
+from jaxtrapolate.radiance import By, demodulate, log_decode, log_encode
 from jaxtrapolate.records import GBuffer
 from jaxtrapolate.weights import configured, fit, load_orbax, load_weights, read_torch, save_weights
 
@@ -136,12 +137,30 @@ def features(buffers: GBuffer | None, like: Float[Array, "h w c"], preparation: 
     return jnp.concatenate([normal, depth, *rest], -1)
 
 
-def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
-    def encode(image):
-        """log(1 + r) in at least float32; what is not finite counts as 0."""
-        image = image.astype(jnp.promote_types(image.dtype, jnp.float32))
-        return log_encode(jnp.where(jnp.isfinite(image), image, 0))
+def encode(image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
+    """log(1 + r) in at least float32; what is negative or not finite counts as 0."""
+    image = image.astype(jnp.promote_types(image.dtype, jnp.float32))
+    return log_encode(jnp.where(jnp.isfinite(image), image, 0))
 
+
+def encoded_truth(
+    color: Float[Array, "h w 3"], buffers: GBuffer | None, *, preparation: Preparation
+) -> Float[Array, "h w 3"]:
+    """The answer that the network should give: a frame's true colour, demodulated, in the log domain.
+
+    Args:
+        color: `[H, W, 3]`, linear radiance. buffers: of the same frame; without albedo nothing is demodulated.
+        preparation: of the network that is trained.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, or a size that differs.
+    """
+    if buffers is not None and buffers.albedo is not None:
+        color = demodulate(color, demodulated(buffers, preparation.sky), by=preparation.by, floor=preparation.floor)
+    return encode(color)
+
+
+def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
     def function(state, values: Values):
         warped = [encode(image) for image in values["histories"]]
         first = encode(values["warped"])

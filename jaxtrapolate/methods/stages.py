@@ -57,7 +57,7 @@ REPROJECT = reproject_stage()
 """Finds the newest rendered frame and the motion that leads there."""
 
 
-def _demodulated(gbuffer: GBuffer | None, sky: bool) -> GBuffer:
+def demodulated(gbuffer: GBuffer | None, sky: bool) -> GBuffer:
     """The G-buffer as demodulation sees it."""
     gbuffer = check_present("gbuffer", gbuffer, needed_by="demodulation")
     return gbuffer if sky else replace(gbuffer, sky=None)
@@ -74,7 +74,7 @@ def demodulate_stage(by: By = "albedo+specular", *, floor: float = 1e-2, sky: bo
     def function(state, values: Values):
         layers = []
         for source in values["sources"]:
-            irradiance = demodulate(source.color, _demodulated(source.gbuffer, sky), by=by, floor=floor)
+            irradiance = demodulate(source.color, demodulated(source.gbuffer, sky), by=by, floor=floor)
             both = "plain_share" in values
             layers.append(jnp.concatenate([irradiance, source.color], -1) if both else irradiance)
         return {"layers": tuple(layers)}
@@ -94,7 +94,7 @@ def modulate_stage(by: By = "albedo+specular", *, floor: float = 1e-2, sky: bool
     """
 
     def function(state, values: Values):
-        image = modulate(values["warped"][..., :3], _demodulated(values["target"].gbuffer, sky), by=by, floor=floor)
+        image = modulate(values["warped"][..., :3], demodulated(values["target"].gbuffer, sky), by=by, floor=floor)
         if "plain_share" in values:
             plain = backward_warp(values["newest"].color, values["motion"])
             plain = jnp.where(values["holes"], values["warped"][..., 3:], plain)
