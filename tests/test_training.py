@@ -3,6 +3,7 @@
 import json
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -83,6 +84,8 @@ def test_what_a_run_writes(whole):
     assert all(entry["step_ms"] > 0 and entry["examples_per_s"] > 0 for entry in train)
     assert sum("pool_ms" in entry for entry in train) == 4  # the first of five came with the compilation
     assert not list(workdir.glob("**/*.tmp"))
+    about = json.loads((workdir / "model" / "metadata" / "metadata").read_text())
+    assert about == {"method": "toy", "config": {}, "note": "for tests"}
     model = read_model(workdir / "model")
     assert {n: v.shape for n, v in model.items()} == {
         **{f"norm/{n}": (3,) for n in ("scale", "bias", "mean", "var")},
@@ -432,6 +435,15 @@ def test_command_with_bad_arguments(capsys, tmp_path):
     assert "file" in fails(capsys, "train", file, "--workdir", tmp_path / "file")
 
 
+def test_models_that_cannot_be_read(whole, tmp_path):
+    with pytest.raises(InputError, match="no trained model there; give the folder `model` of a workdir"):
+        read_model(tmp_path)
+    shutil.copytree(whole[1] / "model", tmp_path / "model")
+    (tmp_path / "model" / "weights" / "_METADATA").write_text("{")
+    with pytest.raises(InputError, match="no model that can be read"):
+        read_model(tmp_path / "model")
+
+
 def test_shipped_configurations():
     from jaxtrapolate.training import config_names
 
@@ -535,6 +547,21 @@ def test_batch_that_cannot_be_divided(tmp_path, monkeypatch):
         train_and_evaluate(config(), tmp_path)
 
 
+COMMAND = """
+import sys
+sys.path.insert(0, {tests!r})
+import toy_task
+from jaxtrapolate.commands.main import main
+real = toy_task.ToyTask.pool
+def pool(self, key, numbers):
+    print(len(numbers), numbers.start, file=open(sys.argv[1] + "-{number}", "a"))
+    return real(self, key, numbers)
+toy_task.ToyTask.pool = pool
+arguments = ["--coordinator", "localhost:{port}", "--processes", "2", "--process", "{number}"]
+sys.exit(main(["train", {file!r}, "--workdir", sys.argv[1], *arguments]))
+"""
+
+
 @pytest.mark.slow
 def test_two_processes_give_what_one_gives(tmp_path):
     """On the loopback, two devices each; each makes its own half of every pool."""
@@ -544,16 +571,12 @@ def test_two_processes_give_what_one_gives(tmp_path):
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]
     table = {**TABLE, "options": {}}
-    watch = "real = toy_task.ToyTask.pool\n"
-    watch += "def pool(self, key, numbers):\n"
-    watch += "    print(len(numbers), numbers.start, file=open(sys.argv[1] + f'-{jax.process_index()}', 'a'))\n"
-    watch += "    return real(self, key, numbers)\n"
-    watch += "toy_task.ToyTask.pool = pool\n"
+    lines = [f"{k} = {json.dumps(v)}" for k, v in table.items() if not isinstance(v, dict)]
+    file = toml(tmp_path / "run.toml", "\n".join([*lines, "[optimizer]", "learning_rate = 0.03", ""]))
     processes = [
-        python(
+        run_python(
+            COMMAND.format(tests=str(TESTS), file=file, port=port, number=i),
             tmp_path / "two",
-            table,
-            before=f"jax.distributed.initialize('localhost:{port}', 2, {i})\n" + watch,
             XLA_FLAGS="--xla_force_host_platform_device_count=2",
         )
         for i in range(2)
@@ -569,15 +592,25 @@ def test_two_processes_give_what_one_gives(tmp_path):
 
 @pytest.mark.slow
 def test_killed_again_and_again(whole, tmp_path):
-    """SIGKILL at random moments of starting, training and saving, until the run gets to its end."""
+    """SIGKILL at random moments of training and saving, ever later, until the run gets to its end."""
     _, workdir, _ = whole
-    rng = np.random.default_rng(0)
-    slow = "import time; real = toy_task.ToyTask.pool\n"
-    slow += "toy_task.ToyTask.pool = lambda *a: (time.sleep(0.3), real(*a))[1]\n"
+    rng, started = np.random.default_rng(0), tmp_path / "started"
+    slow = f"""
+import pathlib, time
+real = toy_task.ToyTask.pool
+def pool(self, key, numbers):
+    pathlib.Path({str(started)!r}).touch()
+    time.sleep(0.3)  # five rounds: the first run is killed before its end
+    return real(self, key, numbers)
+toy_task.ToyTask.pool = pool
+"""
     kills = 0
     for _ in range(30):
-        process = python(tmp_path, TABLE, before=slow)
-        deadline = time.monotonic() + rng.uniform(4, 12)
+        started.unlink(missing_ok=True)
+        process = python(tmp_path / "run", TABLE, before=slow)
+        while process.poll() is None and not started.exists():
+            time.sleep(0.01)
+        deadline = time.monotonic() + rng.uniform(0, 1.4 + 0.4 * kills)
         while process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.01)
         if process.poll() is None:
@@ -589,8 +622,8 @@ def test_killed_again_and_again(whole, tmp_path):
             break
     assert process.returncode == 0
     assert kills >= 1
-    assert numbers(tmp_path) == numbers(workdir)
-    same_models(tmp_path, workdir)
+    assert numbers(tmp_path / "run") == numbers(workdir)
+    same_models(tmp_path / "run", workdir)
 
 
 def test_weight_decay_is_decoupled():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
@@ -284,7 +285,7 @@ class RefineOptions:
 
 
 class Refine(nnx.Module):
-    """A few convolutions that correct the occlusion warp."""
+    """A few convolutions that correct a warp in its holes."""
 
     def __init__(self, rngs):
         self.first = nnx.Conv(8, 16, (3, 3), rngs=rngs)
@@ -294,25 +295,31 @@ class Refine(nnx.Module):
 
     def __call__(self, x):
         y = jax.nn.relu(self.norm(self.first(x)))
-        return x[..., :3] + self.last(jax.nn.relu(self.second(y)))
+        return x[..., :3] + x[..., 3:4] * self.last(jax.nn.relu(self.second(y)))
 
 
 class RefineTask:
-    """Trains it on the method's own stages; at first it is the method itself."""
+    """Trains it on a method's own stages up to the warp; at first it is the warp, ghosts in holes and all."""
 
-    score = "psnr"
+    score, about = "gain", MappingProxyType({})
 
     def __init__(self, options):
-        self.options, self.method = options, jx.load("occlusion_warp")
+        self.options, self.method = options, jx.load("warp")
         self.windows = Windows(options.windows, self.prepare, past=self.method.past)
 
     def prepare(self, window, key):
         history, target, _ = arguments(self.method, window)
-        values = self.method.before("modulate", history, target)
-        buffers, truth = window.target.gbuffer, window.truth.color
-        light = jx.demodulate(truth, buffers)
-        inputs = [jx.log_encode(values["warped"][..., :3]), values["holes"].astype(jnp.float32), buffers.normal]
-        return {"x": jnp.concatenate([*inputs, buffers.roughness], -1), "y": jx.log_encode(light)}
+        values = {"carry": (), "history": history, "target": target, "future": ()}
+        for stage in self.method.active(history, target):
+            if stage.name == "warp":
+                break
+            values |= stage.function(self.method.state, values)
+        newest, motion, buffers = values["newest"], values["motion"], target.gbuffer
+        warped = jx.backward_warp(jx.demodulate(newest.color, newest.gbuffer), motion)
+        holes = jx.hole_masks(buffers, newest.gbuffer, motion, taps="nearest").any.astype(jnp.float32)
+        truth = jx.demodulate(window.truth.color, buffers)
+        inputs = [jx.log_encode(warped), holes, buffers.normal, buffers.roughness]
+        return {"x": jnp.concatenate(inputs, -1), "y": jx.log_encode(truth)}
 
     def init(self, rngs):
         return Refine(rngs)
@@ -327,16 +334,16 @@ class RefineTask:
         return jnp.mean(jnp.abs(model(batch["x"]) - batch["y"])), {}
 
     def validate(self, model):
-        pool = self.windows.pool(jax.random.key(1), range(6), validation=True)
-        made = model(pool["x"])
-        errors = {"psnr": made, "warped": pool["x"][..., :3]}
-        scores = {n: -10 * float(jnp.log10(jnp.mean((v - pool["y"]) ** 2))) for n, v in errors.items()}
-        return scores, {"made": jx.tonemap(jx.log_decode(made[0])), "true": jx.tonemap(jx.log_decode(pool["y"][0]))}
+        pool = self.windows.pool(jax.random.key(1), range(8), validation=True)
+        made, warped, true, holes = model(pool["x"]), pool["x"][..., :3], pool["y"], pool["x"][..., 3:4]
+        error, ghosts = (float(jnp.sum(holes * jnp.abs(v - true)) / jnp.sum(holes) / 3) for v in (made, warped))
+        scores = {"gain": ghosts / error, "error": error, "ghosts": ghosts}
+        return scores, {"made": jx.tonemap(jx.log_decode(made[0])), "true": jx.tonemap(jx.log_decode(true[0]))}
 
 
 @pytest.mark.slow
 def test_a_network_trained_on_rendered_windows(tmp_path):
-    """On seeds that it never saw it is better than the warp that it is given."""
+    """On seeds that it never saw, its error in holes is less than that of the warp that it is given."""
     options = RefineOptions(windows=WindowOptions(size=(48, 64), scenes=("demo",)))
     settings = Config(
         task="refine",
@@ -353,5 +360,5 @@ def test_a_network_trained_on_rendered_windows(tmp_path):
     scores = train_and_evaluate(settings, tmp_path, task=RefineTask(options))
     losses = [entry["loss"] for entry in read_metrics(tmp_path) if entry["kind"] == "train"]
     assert losses[-1] < losses[0]
-    assert scores["psnr"] > scores["warped"] + 0.3
+    assert scores["gain"] > 1.3
     assert len(list((tmp_path / "images").iterdir())) == 2

@@ -1,6 +1,7 @@
 """A small task for tests of the training loop: a linear map of pixels, whose answer is known, after batch norm."""
 
 import dataclasses
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
@@ -53,6 +54,7 @@ class ToyTask:
     """Random images and their linear map."""
 
     score = "negative"
+    about = MappingProxyType({"method": "toy", "config": {}, "note": "for tests"})
 
     def __init__(self, options=None):
         self.options, self.asked = options or ToyOptions(), []

@@ -122,10 +122,11 @@ def _weight(values: Values) -> Array:
     in_first, in_second = values["seen"]
     at = (values["to_previous"], values["to_next"])
     inside = [in_frame(motion)[..., None] for motion in at]
-    depth = depth_of(values["target"])
-    apart = [
-        jnp.abs(backward_warp(depth_of(values[n]), m) - depth) for n, m in zip(("previous", "next"), at, strict=True)
-    ]
+    depth, *depths = (
+        check_present(f"{name}.depth", depth_of(values[name]), needed_by="the blend")
+        for name in ("target", "previous", "next")
+    )
+    apart = [jnp.abs(backward_warp(there, motion) - depth) for there, motion in zip(depths, at, strict=True)]
     likelier = jnp.where(inside[0] == inside[1], apart[1] < apart[0], inside[1])
     one = jnp.where(in_first == in_second, likelier, in_second)
     return jnp.where(in_first & in_second, values["alpha"], one.astype(values["alpha"].dtype))
@@ -199,7 +200,8 @@ def relight_stage(by: By) -> Stage:
     """Blends light instead of colour: over each frame's reflectance, times the target's.
 
     Where light is not reflectance times irradiance (emission, fog) that prints a texture which is not there. There the
-    two frames agree better as they are: blocks of 8 x 8 pixels take the colour as it is by how much better it agrees.
+    two frames agree better as they are: blocks of 8 x 8 pixels take the colour as it is by how much better it agrees,
+    and so do pixels that stand still.
     """
 
     def function(state, values: Values):
@@ -208,12 +210,16 @@ def relight_stage(by: By) -> Stage:
         (first, second), weight, both = values["fetched"], values["weight"], values["both"]
         light = [modulate(layers[..., :3], values["target"].gbuffer, by=by) for layers in (first, second)]
         a, b = _apart(first[..., 3:], second[..., 3:], both) * _MARGIN**2, _apart(light[0], light[1], both)
-        share = jnp.where(a + b > 0, b / jnp.where(a + b > 0, a + b, 1), 0)
+        relit = jnp.where(a + b > 0, a / jnp.where(a + b > 0, a + b, 1), 1)
         height, width = both.shape[:2]
-        x, y = pixel_grid(height, width, share.dtype)
+        x, y = pixel_grid(height, width, relit.dtype)
         x, y = (jnp.broadcast_to((v + 0.5) / _BLOCK - 0.5, (height, width)) for v in (x, y))
-        share = sample(share, x, y)
-        return {"image": mix(mix(light[0], light[1], weight), values["image"], share)}
+        relit = sample(relit, x, y)
+        stands = jnp.all(first[..., 3:] == second[..., 3:], -1, keepdims=True)
+        for motion in (values["to_previous"], values["to_next"]):
+            stands &= jnp.all(motion == 0, -1, keepdims=True)
+        relit = jnp.where(stands, 0, relit)
+        return {"image": mix(values["image"], mix(light[0], light[1], weight), relit)}
 
     return Stage("relight", function, reads=("history.albedo", "target.albedo", "future.albedo"), optional=True)
 

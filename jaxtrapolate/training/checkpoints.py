@@ -72,19 +72,23 @@ def model_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
     return {"/".join(map(str, path)): np.asarray(variable[...]) for path, variable in pairs}
 
 
-def save_model(folder: Path, model: nnx.Module) -> None:
-    """Saves `model_arrays` as an Orbax checkpoint, in place of what was there; all hosts call it."""
-    with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(folder.absolute(), model_arrays(model), force=True)
+def save_model(folder: Path, model: nnx.Module, *, about: Mapping[str, Any]) -> None:
+    """Saves `model_arrays` as an Orbax checkpoint, in place of what was there; all hosts call it.
+
+    about: JSON that is saved with them. The checkpoint's items are "weights" and "metadata".
+    """
+    items = {"weights": ocp.args.StandardSave(model_arrays(model)), "metadata": ocp.args.JsonSave(dict(about))}
+    with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
+        checkpointer.save(folder.absolute(), args=ocp.args.Composite(**items), force=True)
 
 
 def read_model(folder: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """The arrays that `save_model` saved, by name; raises `InputError` where there are none."""
     path = Path(folder).absolute()
-    if not path.is_dir():
+    if not (path / "weights").is_dir():
         raise InputError(f"{folder}: no trained model there; give the folder `model` of a workdir")
-    with ocp.StandardCheckpointer() as checkpointer:
-        try:
-            return checkpointer.restore(path)
-        except (ValueError, FileNotFoundError) as error:
-            raise InputError(f"{folder}: no model that can be read ({' '.join(str(error).split())})") from error
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            return checkpointer.restore(path / "weights")
+    except (ValueError, OSError) as error:
+        raise InputError(f"{folder}: no model that can be read ({' '.join(str(error).split())})") from error

@@ -37,9 +37,10 @@ def train_and_evaluate(
     """Trains a network as a configuration says, from a workdir's last checkpoint on; the last validation's scores.
 
     In the workdir: config.json; metrics.jsonl; checkpoints/, the last few and the best; images/ of each validation; at
-    the end model/, the (averaged) weights. On one CPU a run that was killed and resumed gives the same numbers bit for
-    bit. On all devices of all hosts that `jax.distributed` knows; these share the workdir, and losses are the same on
-    any number of devices but for rounding. A score that is not finite is None here and null in metrics.jsonl.
+    the end model/, the (averaged) weights, see `read_model`. On one CPU a run that was killed and resumed gives the
+    same numbers bit for bit. It runs on all devices of all hosts that `jax.distributed` knows; these share the workdir,
+    and losses are the same on any number of devices but for rounding. A score that is not finite is None here and null
+    in metrics.jsonl.
 
     Args:
         config: see `Config`.
@@ -73,7 +74,7 @@ def train_and_evaluate(
         with _Pools(task, config, ahead=ahead) as pools:
             run = _Run(config, task, step, pools, checkpoints, journal, report)
             state = run.go(state, start)
-    save_model(folder / "model", step.model(state))
+    save_model(folder / "model", step.model(state), about=task.about)
     validated = [line for line in read_metrics(folder) if line["kind"] == "validation"]
     return {name: value for name, value in validated[-1].items() if name not in ("kind", "step")}
 
@@ -155,8 +156,7 @@ class _Run:
         self._tell("compile", start)
         begun, compiled = time.perf_counter(), start + 1
         for number in range(start, config.steps):
-            pool = self._pools.of(number, state)
-            state, metrics = self._step.take(state, pool)
+            state, metrics = self._step.take(state, self._pools.of(number, state))
             pending.append(metrics)
             done, last = number + 1, number + 1 == config.steps
             if done == compiled:

@@ -26,9 +26,12 @@ class Task(Protocol):
 
     Attributes:
         score: name of the metric of `validate` by which the best checkpoint is told; larger is better.
+        about: what the exported weights say about themselves, as in JSON: "method", "config" to build its network with,
+            "note".
     """
 
     score: str
+    about: Mapping[str, Any]
 
     def init(self, rngs: nnx.Rngs) -> nnx.Module:
         """The network with its initial weights.

@@ -1,8 +1,8 @@
 """Examples: a frame to be made and what surrounds it, from the embedded scenes without end, or from dumps.
 
 An example is a `Window`, as evaluation hands it to methods: history of rendered frames with the buffers of the frames
-between them, the target without colour, the truth. A task runs its method's own stages on it, up to the network
-(`Method.values_before`), once for each example of a pool and at full frame; batches are cut from what that gives.
+between them, the target without colour, the truth. A task runs its method's own stages on it, up to the network, once
+for each example of a pool and at full frame; batches are cut from what that gives.
 """
 
 import dataclasses

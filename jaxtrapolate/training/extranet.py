@@ -1,0 +1,168 @@
+"""Training of ExtraNet (Guo et al. 2021, section 4.6): the method's own stages prepare, its network learns the rest."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, PRNGKeyArray
+
+from jaxtrapolate.checks import Size, check_present
+from jaxtrapolate.evaluation import Window
+from jaxtrapolate.losses import extranet_loss
+from jaxtrapolate.methods.extranet import Preparation, encoded_truth, extranet, extranet_config
+from jaxtrapolate.methods.stages import demodulated
+from jaxtrapolate.metrics import psnr
+from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
+from jaxtrapolate.radiance import compress, demodulation_divisor, log_decode, tonemap
+from jaxtrapolate.training.augment import crop
+from jaxtrapolate.training.config import check_range
+from jaxtrapolate.training.tasks import Batch, Example
+from jaxtrapolate.training.windows import WindowOptions, Windows
+
+_SHOWN = 4  # windows that validation shows
+
+
+@dataclasses.dataclass(frozen=True)
+class ExtraNetOptions:
+    """What is learned, from what.
+
+    Attributes:
+        network: its size, and what is left out of it.
+        preparation: what it is shown; goes into the file of its weights.
+        windows: the examples.
+        crop: `(H, W)` of an item, a multiple of the network's.
+        space: where errors are measured: "log" of the light, as in the paper; or "display", `compress` of the image,
+            where an error under a dark albedo counts as little as it is seen.
+        hole_weight, shade_weight, shade, shade_fraction: of `extranet_loss`.
+        validation: windows that validation looks at.
+    """
+
+    network: ExtraNetConfig = dataclasses.field(default_factory=ExtraNetConfig)
+    preparation: Preparation = dataclasses.field(default_factory=Preparation)
+    windows: WindowOptions = dataclasses.field(default_factory=WindowOptions)
+    crop: Size = (128, 128)
+    space: Literal["log", "display"] = "log"
+    hole_weight: float = 1.0
+    shade_weight: float = 1.0
+    shade: Literal["release", "paper"] = "release"
+    shade_fraction: float = 0.1
+    validation: int = 36
+
+    def __post_init__(self) -> None:
+        for name in ("hole_weight", "shade_weight"):
+            check_range(self, name, least=0)
+        check_range(self, "shade_fraction", above=0, most=1)
+        check_range(self, "validation", least=1)
+        if any(a > b for a, b in zip(self.crop, self.windows.size, strict=True)):
+            raise ValueError(f"crop: expected at most windows.size = {list(self.windows.size)}, got {list(self.crop)}")
+
+
+class ExtraNetTask:
+    """Trains an `ExtraNet` on what the method "extranet" shows it. Where the sky is, nothing is learned or scored.
+
+    An example holds the network's inputs, histories `[H, W, N, 4]` so that all is cut alike; "target", the true light
+    in the log domain, NaN at the sky; and "divisor", the target's reflectance.
+    """
+
+    score = "gain"
+
+    def __init__(self, options: ExtraNetOptions = ExtraNetOptions()) -> None:
+        self.options = options
+        # preparation looks at the configuration alone
+        self._stages = extranet(ExtraNet(options.network, rngs=nnx.Rngs(0)), preparation=options.preparation)
+        self._windows = Windows(options.windows, self._prepare, past=self._stages.past)
+        self._held: Example | None = None
+        config = extranet_config(options.network, options.preparation)
+        scenes = ", ".join(options.windows.scenes)
+        self.about: Mapping[str, Any] = {"method": "extranet", "config": config, "note": f"trained on {scenes}"}
+
+    def _prepare(self, window: Window, key: PRNGKeyArray) -> Example:
+        del key
+        method, preparation = self._stages, self.options.preparation
+        values = method.values_before("network", method.state, (), window.history, window.target)
+        buffers = check_present("gbuffer", window.truth.gbuffer, needed_by="training")
+        color = check_present("color", window.truth.color, needed_by="training")
+        target, divisor = encoded_truth(color, buffers, preparation=preparation), jnp.ones_like(color)
+        if buffers.albedo is not None:
+            how: dict[str, Any] = {"by": preparation.by, "floor": preparation.floor}
+            divisor = demodulation_divisor(demodulated(buffers, preparation.sky), **how)
+        if buffers.sky is not None:
+            target = jnp.where(buffers.sky > 0.5, jnp.nan, target)
+        inputs = {name: value for name, value in values["inputs"].items() if value is not None}
+        if "history" in inputs:
+            inputs["history"] = jnp.moveaxis(inputs["history"], 0, 2)  # [H, W, N, 4]: crops cut the leading axes
+        return inputs | {"target": target, "divisor": jnp.broadcast_to(divisor, color.shape).astype(target.dtype)}
+
+    def init(self, rngs: nnx.Rngs) -> nnx.Module:
+        """A new network."""
+        return ExtraNet(self.options.network, rngs=rngs)
+
+    def pool(self, key: PRNGKeyArray, numbers: range) -> Example:
+        """Prepared windows of the scenes' training seeds."""
+        return self._windows.pool(key, numbers)
+
+    def sample(self, example: Example, key: PRNGKeyArray) -> Batch:
+        """A random crop."""
+        return crop(example, key, size=self.options.crop)
+
+    def loss(self, model: nnx.Module, batch: Batch) -> tuple[Array, Mapping[str, Array]]:
+        """`extranet_loss` in the space that the options say, its mean over the batch."""
+        o = self.options
+        made, truth = _answer(model, batch), batch["target"]
+        if o.space == "display":
+            made, truth = (_display(light, batch["divisor"]) for light in (made, truth))
+        how: dict[str, Any] = {"hole_weight": o.hole_weight, "shade_weight": o.shade_weight}
+        how |= {"shade": o.shade, "fraction": o.shade_fraction}
+        total, parts = jax.vmap(lambda *a: extranet_loss(*a, **how))(made, truth, batch["mask"].astype(jnp.float32))
+        return jnp.mean(total), {name: jnp.mean(part) for name, part in parts.items()}
+
+    def validate(self, model: nnx.Module) -> tuple[Mapping[str, float], Mapping[str, Any]]:
+        """dB of whole validation windows, tone mapped: "psnr", in holes "psnr_hole"; "gain" over the first guess."""
+        if self._held is None:
+            self._held = self._windows.pool(jax.random.key(0), range(self.options.validation), validation=True)
+        rows, images = [], {}
+        for i in range(self.options.validation):
+            one = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], self._held)
+            row, shown = _scored(model, one)
+            rows.append({name: float(value) for name, value in row.items()})
+            if i < _SHOWN:
+                images[f"window{i}"] = np.asarray(shown)
+        scores = {}
+        for name in rows[0]:
+            known = [row[name] for row in rows if np.isfinite(row[name])]
+            scores[name] = float(np.mean(known)) if known else float("nan")
+        return {"gain": scores["psnr"] - scores["guess"], **scores}, images
+
+
+def _answer(model: Any, batch: Batch) -> Array:
+    history = jnp.moveaxis(batch["history"], 3, 1) if "history" in batch else None
+    return model(batch["x"], batch["mask"], batch.get("features"), history)
+
+
+def _display(light: Array, divisor: Array) -> Array:
+    """Light in the log domain as an image after `compress`; NaN stays."""
+    known = jnp.isfinite(light)
+    return jnp.where(known, compress(log_decode(jnp.where(known, light, 0)) * divisor), jnp.nan)
+
+
+@nnx.jit
+def _scored(model: Any, one: Batch) -> tuple[dict[str, Array], Array]:
+    """The scores of one window, and the true image, the answer and the difference side by side."""
+    truth, divisor, hole = one["target"][0], one["divisor"][0], one["mask"][0] < 0.5
+    known = jnp.isfinite(truth[..., :1])
+    images = {"psnr": _answer(model, one)[0], "guess": one["x"][0, ..., :3]}
+    if one["x"].shape[-1] == 6:
+        images["composite"] = one["x"][0, ..., 3:]
+    true, *made = (
+        tonemap(jnp.where(known, log_decode(jnp.where(known, light, 0)) * divisor, 0))
+        for light in (truth, *images.values())
+    )
+    scores = {}
+    for name, image in zip(images, made, strict=True):
+        scores[name] = psnr(image, true, mask=known)
+        scores[f"{name}_hole"] = psnr(image, true, mask=known & hole)
+    return scores, jnp.concatenate([true, made[0], jnp.minimum(4 * jnp.abs(made[0] - true), 1)], 1)

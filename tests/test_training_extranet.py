@@ -1,0 +1,157 @@
+"""Training of ExtraNet: what an example holds, what counts in the loss, that the trained network is the method's."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from synthetic import make_frame
+
+import jaxtrapolate as jx
+from jaxtrapolate.evaluation import Window, hide
+from jaxtrapolate.methods.extranet import Preparation, extranet
+from jaxtrapolate.networks.extranet import ExtraNetConfig
+from jaxtrapolate.records import replace
+from jaxtrapolate.training import Config, ExtraNetOptions, ExtraNetTask, Optimizer, load_config, train_and_evaluate
+from jaxtrapolate.training.config import parse_config
+from jaxtrapolate.training.windows import WindowOptions
+
+SMALL = ExtraNetConfig(widths=(4, 6))
+OPTIONS = ExtraNetOptions(network=SMALL, windows=WindowOptions(size=(32, 40)), crop=(16, 24), validation=2)
+
+
+def make_window(seed=0):
+    frames = [jax.tree.map(jnp.asarray, make_frame(seed + k)) for k in range(6)]
+    history = tuple(hide(frame) if k % 2 else frame for k, frame in enumerate(frames[:5]))
+    return Window(number=5, truth=frames[5], history=history, target=hide(frames[5]), future=())
+
+
+@functools.cache
+def example(**changes):
+    """An example, prepared by a task whose options are changed."""
+    task = ExtraNetTask(dataclasses.replace(OPTIONS, **changes))
+    return task, jax.jit(task._prepare)(make_window(), jax.random.key(0))
+
+
+def test_the_right_answer_gives_the_true_frame():
+    """The target, decoded and modulated, is the truth; the sky is left out."""
+    _, made = example()
+    truth, target = make_window().truth, np.asarray(made["target"])
+    sky = (
+        np.asarray(truth.gbuffer.sky)[..., 0] > 0.5
+        if truth.gbuffer.sky is not None
+        else np.zeros(target.shape[:2], bool)
+    )
+    assert np.isnan(target[sky]).all()
+    image = np.expm1(target) * np.asarray(made["divisor"])
+    np.testing.assert_allclose(image[~sky], np.asarray(truth.color)[~sky], rtol=1e-5, atol=1e-6)
+
+
+def test_an_example_is_what_the_method_shows_its_network():
+    task, made = example()
+    window = make_window()
+    model = task.init(nnx.Rngs(3))
+    model.eval()
+    method = extranet(model, preparation=OPTIONS.preparation)
+    values = method.values_before("network", method.state, (), window.history, window.target)
+    for name, value in values["inputs"].items():
+        found = np.moveaxis(np.asarray(made[name]), 2, 0) if name == "history" else made[name]
+        np.testing.assert_allclose(found, value, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("space", ["log", "display"])
+def test_the_loss_is_that_of_the_paper(space):
+    """In float64: l1 + hole + the largest tenth, of what is no sky; display: after sqrt(x / (1 + x)) of the image."""
+    task, made = example(space=space)
+    batch = jax.tree.map(lambda leaf: leaf[None], made)
+    model = task.init(nnx.Rngs(0))
+    model.eval()
+    total, parts = task.loss(model, batch)
+    answer = np.float64(
+        model(made["x"][None], made["mask"][None], made["features"][None], jnp.moveaxis(made["history"], 2, 0)[None])[0]
+    )
+    truth, divisor, mask = (np.float64(made[name]) for name in ("target", "divisor", "mask"))
+    known = np.isfinite(truth)
+    if space == "display":
+        answer, truth = (np.maximum(np.expm1(light), 0) * divisor for light in (answer, truth))
+        answer, truth = (np.sqrt(light / (1 + light)) for light in (answer, truth))
+    error = np.where(known, np.abs(answer - truth), 0)
+    hole = np.broadcast_to(1 - mask, error.shape) * known
+    count = known[..., 0].sum()
+    top = [np.sort(error[..., c][known[..., c]])[::-1][: int(0.1 * count)].mean() for c in range(3)]
+    expected = {
+        "l1": error.sum() / known.sum(),
+        "hole": (error * hole).sum() / max(hole.sum(), 1),
+        "shade": np.mean(top),
+    }
+    for name, value in expected.items():
+        np.testing.assert_allclose(parts[name], value, rtol=2e-4, err_msg=name)
+    np.testing.assert_allclose(total, sum(expected.values()), rtol=2e-4)
+
+
+def test_the_sky_has_no_gradient():
+    task, made = example()
+    made = made | {"target": made["target"].at[:16].set(jnp.nan)}
+    graph, weights, rest = nnx.split(task.init(nnx.Rngs(0)), nnx.Param, ...)
+
+    def loss(x):
+        return task.loss(
+            nnx.merge(graph, weights, rest, copy=True), jax.tree.map(lambda leaf: leaf[None], made | {"x": x})
+        )[0]
+
+    gradient = np.asarray(jax.grad(loss)(made["x"]))
+    assert np.isfinite(gradient).all()
+    assert np.abs(gradient[16:]).max() > 0
+
+
+def test_a_scene_without_albedo_or_sky():
+    window = make_window()
+
+    def strip(frame):
+        return replace(frame, gbuffer=replace(frame.gbuffer, albedo=None, sky=None, sky_color=None))
+
+    bare = Window(5, strip(window.truth), tuple(map(strip, window.history)), strip(window.target), ())
+    made = jax.jit(ExtraNetTask(OPTIONS)._prepare)(bare, jax.random.key(0))
+    np.testing.assert_allclose(made["target"], np.log1p(np.maximum(window.truth.color, 0)), rtol=1e-6)
+    np.testing.assert_array_equal(made["divisor"], 1)
+
+
+def test_shipped_configurations():
+    for name in ("extranet", "extranet_cpu"):
+        config = load_config(name)
+        assert isinstance(config.options, ExtraNetOptions)
+        multiple = config.options.network.multiple
+        assert all(side % multiple == 0 for side in config.options.crop)
+
+
+def test_errors():
+    with pytest.raises(ValueError, match=r"options\.crop: expected at most windows\.size"):
+        parse_config({"task": "extranet", "steps": 1, "options": {"crop": [500, 500]}})
+    with pytest.raises(ValueError, match=r"options\.space: expected one of 'log', 'display', got 'srgb'"):
+        parse_config({"task": "extranet", "steps": 1, "options": {"space": "srgb"}})
+    with pytest.raises(ValueError, match=r"options\.preparation.first_guess"):
+        parse_config({"task": "extranet", "steps": 1, "options": {"preparation": {"first_guess": "best"}}})
+
+
+@pytest.mark.slow
+def test_a_short_run_learns_and_its_weights_load(tmp_path):
+    """On one embedded scene the loss falls, and `load` takes what the run leaves."""
+    windows = WindowOptions(size=(48, 64), scenes=("still", "walkers"))
+    options = ExtraNetOptions(
+        network=SMALL, windows=windows, crop=(32, 48), validation=2, preparation=Preparation(first_guess="guided")
+    )
+    config = Config("extranet", options, steps=120, batch=4, pool=8, steps_per_round=60, log_every=20,
+                    checkpoint_every=120, validate_every=120, optimizer=Optimizer(learning_rate=3e-3))  # fmt: skip
+    scores = train_and_evaluate(config, tmp_path)
+    assert set(scores) >= {"gain", "psnr", "psnr_hole", "guess", "composite"}
+    lines = [line for line in (tmp_path / "metrics.jsonl").read_text().splitlines() if '"train"' in line]
+    losses = [float(line.split('"loss": ')[1].split(",")[0]) for line in lines]
+    assert np.mean(losses[-2:]) < 0.7 * losses[0]
+    method = jx.load("extranet", weights=tmp_path / "model")
+    window = make_window()
+    image = method(window.history, window.target)
+    assert np.isfinite(image).all()
+    assert "guided warp" in [stage.name for stage in method.stages]
