@@ -75,6 +75,27 @@ def _guided(sigma_guide: float, sigma_space: float, guides: str) -> Operation:
     )
 
 
+def _search(filter: Any) -> Operation:
+    """Three steps in one direction, half way (Yang et al. 2011, section 5.1): the places and their errors."""
+
+    def function(flow):
+        found = jt.iterative_search(flow, _HALF, filter=filter, iterations=3)
+        return found.position, found.error
+
+    loop = numba_loop(peers.search_nearest if filter == "nearest" else peers.search_bilinear, np.float32(_HALF), 3)
+    peer = Peer("numba", "numba", loop, tolerance=1e-3, share=_TIES if filter == "nearest" else 1e-4)
+    return Operation(f"iterative_search {filter}", function, ("motion",), (peer,))
+
+
+def _between(image, motion, depth, *, assisted: bool):
+    """A whole frame half way between two whose flows are opposite; assisted: by its own flows to both."""
+    forward, backward = (jnp.concatenate([s * motion, jnp.zeros_like(depth)], -1) for s in (1, -1))
+    previous, following = (jt.Keyframe(image, depth, forward_flow=forward, backward_flow=backward) for _ in range(2))
+    target = jt.Keyframe(depth=depth, forward_flow=_HALF * forward, backward_flow=_HALF * backward)
+    return jt.interpolate_bidirectional(previous, following, _HALF, target=target if assisted else None).color
+
+
+_HALF = 0.5
 _IMAGE_MOTION = ("image", "motion")
 OPERATIONS = (
     Operation(
@@ -151,6 +172,18 @@ OPERATIONS = (
         jt.occlusion_motion,
         ("motion", "depth"),
         (Peer("numba", "numba", numba_loop(peers.occlusion_motion, parallel=False), share=_TIES, note="sequential"),),
+    ),
+    _search("nearest"),
+    _search("bilinear"),
+    *(
+        Operation(
+            f"interpolate_bidirectional {'scene-assisted' if assisted else 'image-based'}",
+            partial(_between, assisted=assisted),
+            ("image", "motion", "depth"),
+            gpu_tolerance=1e-3,
+            gpu_share=2e-3,
+        )
+        for assisted in (False, True)
     ),
     _guided(0.05, 1.0, "float32"),
     _guided(0.05, 1.0, "packed"),

@@ -265,6 +265,53 @@ def chain(newer, older):
     return result
 
 
+def search_nearest(flow, fraction, steps):
+    """The fixed point of Yang et al. 2011, eq. 5, the flow by the nearest pixel; its place, and its error (eq. 7)."""
+    height, width, _ = flow.shape
+    place, error = np.empty((height, width, 2), np.float32), np.empty((height, width, 1), np.float32)
+    half = np.float32(0.5)
+    for y in prange(height):
+        for x in range(width):
+            px, py = np.float32(x), np.float32(y)
+            qx, qy = px, py
+            for _ in range(steps):
+                i = min(max(math.floor(qx + half), 0), width - 1)
+                j = min(max(math.floor(qy + half), 0), height - 1)
+                qx, qy = px - fraction * flow[j, i, 0], py - fraction * flow[j, i, 1]
+            i = min(max(math.floor(qx + half), 0), width - 1)
+            j = min(max(math.floor(qy + half), 0), height - 1)
+            ex, ey = qx + fraction * flow[j, i, 0] - px, qy + fraction * flow[j, i, 1] - py
+            place[y, x, 0], place[y, x, 1] = qx, qy
+            error[y, x, 0] = math.sqrt(ex * ex + ey * ey)
+    return place, error
+
+
+def search_bilinear(flow, fraction, steps):
+    """As `search_nearest`, the flow interpolated, its edge repeated."""
+    height, width, _ = flow.shape
+    place, error = np.empty((height, width, 2), np.float32), np.empty((height, width, 1), np.float32)
+    one = np.float32(1)
+    for y in prange(height):
+        for x in range(width):
+            px, py = np.float32(x), np.float32(y)
+            qx, qy, u, v = px, py, np.float32(0), np.float32(0)
+            for k in range(steps + 1):
+                cx = min(max(qx, np.float32(0)), np.float32(width - 1))
+                cy = min(max(qy, np.float32(0)), np.float32(height - 1))
+                i, j = min(int(cx), width - 2), min(int(cy), height - 2)
+                s, t = cx - np.float32(i), cy - np.float32(j)
+                u = (flow[j, i, 0] * (one - s) + flow[j, i + 1, 0] * s) * (one - t)
+                u += (flow[j + 1, i, 0] * (one - s) + flow[j + 1, i + 1, 0] * s) * t
+                v = (flow[j, i, 1] * (one - s) + flow[j, i + 1, 1] * s) * (one - t)
+                v += (flow[j + 1, i, 1] * (one - s) + flow[j + 1, i + 1, 1] * s) * t
+                if k < steps:
+                    qx, qy = px - fraction * u, py - fraction * v
+            ex, ey = qx + fraction * u - px, qy + fraction * v - py
+            place[y, x, 0], place[y, x, 1] = qx, qy
+            error[y, x, 0] = math.sqrt(ex * ex + ey * ey)
+    return place, error
+
+
 def splat_nearest(values, motion, depth):
     """Each value to the four pixel centres around its landing place; a depth buffer decides."""
     height, width, channels = values.shape

@@ -67,7 +67,7 @@ def test_all_operations_without_peers(operations, tmp_path, monkeypatch, capsys)
         ("cv2", "bilinear,warp nearest,bicubic,chain"),
         ("scipy", "bilinear,warp nearest,chain"),
         ("torch", "bilinear,warp nearest,bicubic"),
-        ("numba", "bicubic,softmax,occlusion,warp float32"),
+        ("numba", "bicubic,softmax,occlusion,search,warp float32"),
     ],
 )
 def test_answers_of_a_peer_agree(operations, tmp_path, monkeypatch, module, names):
