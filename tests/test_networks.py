@@ -15,7 +15,7 @@ from scipy.ndimage import zoom
 from scipy.signal import correlate2d
 
 from jaxtrapolate.networks import GATED_CONVOLUTION, ExtraNet, ExtraNetConfig, extranet_from_torch, fold, inference
-from jaxtrapolate.networks.blocks import Layer, double, pad_to_multiple
+from jaxtrapolate.networks.blocks import HE, Layer, double, pad_to_multiple
 
 PAPER = ExtraNetConfig()
 SMALL = ExtraNetConfig(widths=(3, 4), features=2, histories=2)
@@ -209,6 +209,15 @@ def test_initialisation_is_pytorchs():
         assert np.abs(array).max() <= limit
         assert np.abs(array).max() > 0.95 * limit
         np.testing.assert_allclose(np.std(array), limit / np.sqrt(3), rtol=0.1)
+
+
+def test_initialisation_with_a_gain_keeps_the_size_of_signals():
+    """He et al. 2015: through a ReLU the mean square stays what it was; biases are 0."""
+    layer = Layer(64, 64, norm=False, gain=HE, rngs=nnx.Rngs(0))
+    assert not np.any(layer.feature.bias[...])
+    x = jax.nn.relu(jax.random.normal(jax.random.key(1), (1, 32, 32, 64)))
+    inner = layer(x)[:, 1:-1, 1:-1]
+    np.testing.assert_allclose(np.mean(np.square(inner)), np.mean(np.square(x)), rtol=0.15)
 
 
 def test_prelu():

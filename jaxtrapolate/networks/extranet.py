@@ -174,7 +174,7 @@ def _release_names(model: ExtraNet) -> list[tuple[Any, str, str | None]]:
     return [*names, (model.output, "outc", None)]
 
 
-def from_torch(state_dict: Mapping[str, np.ndarray], *, config: ExtraNetConfig = ExtraNetConfig()) -> ExtraNet:
+def extranet_from_torch(state_dict: Mapping[str, np.ndarray], *, config: ExtraNetConfig = ExtraNetConfig()) -> ExtraNet:
     """An `ExtraNet` with weights by the names and in the layout of the authors' release, set to evaluation.
 
     Args:
