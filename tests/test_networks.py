@@ -1,9 +1,5 @@
 """Networks: against a float64 network written from the paper, SciPy, the authors' weights and answers."""
 
-import collections
-import pickle
-import zipfile
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +12,7 @@ from scipy.signal import correlate2d
 
 from jaxtrapolate.networks import GATED_CONVOLUTION, ExtraNet, ExtraNetConfig, extranet_from_torch, fold, inference
 from jaxtrapolate.networks.blocks import HE, Layer, double, pad_to_multiple
+from jaxtrapolate.weights import read_torch
 
 PAPER = ExtraNetConfig()
 SMALL = ExtraNetConfig(widths=(3, 4), features=2, histories=2)
@@ -406,37 +403,14 @@ def test_errors(unchecked):
 # The authors' weights
 
 
-def read_checkpoint(path):
-    """The state dict of a PyTorch checkpoint: a zip of a pickle and of the raw storages."""
-    archive = zipfile.ZipFile(path)
-    folder = archive.namelist()[0].split("/")[0]
-
-    def rebuild(storage, offset, shape, *_):
-        return storage[offset:][: int(np.prod(shape))].reshape(shape)
-
-    names = {
-        "OrderedDict": collections.OrderedDict,
-        "_rebuild_tensor_v2": rebuild,
-        "FloatStorage": np.float32,
-        "LongStorage": np.int64,
-    }
-
-    class Reader(pickle.Unpickler):
-        def find_class(self, module_name, global_name):
-            return names[global_name]
-
-        def persistent_load(self, pid):
-            return np.frombuffer(archive.read(f"{folder}/data/{pid[2]}"), pid[1])
-
-    return Reader(archive.open(f"{folder}/data.pkl")).load()["state_dict"]
-
-
 @pytest.fixture(scope="module")
 def released(data):
     """The authors' network, and their inputs and answers for two sizes."""
     vectors = np.load(data / "extranet_vectors.npz")
     names = ("x", "mask", "features", "history", "output")
-    return read_checkpoint(data / "extranet_medieval.pth.tar"), [[vectors[f"{k}_{n}"] for n in names] for k in (0, 1)]
+    return read_torch(data / "extranet_medieval.pth.tar")["state_dict"], [
+        [vectors[f"{k}_{n}"] for n in names] for k in (0, 1)
+    ]
 
 
 def test_released_answers(released):

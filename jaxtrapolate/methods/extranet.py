@@ -29,7 +29,7 @@ from jaxtrapolate.methods.stages import (
     reproject_stage,
 )
 from jaxtrapolate.methods.warping import GUIDED
-from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig, from_torch
+from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig, extranet_from_torch
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.radiance import By, demodulate, log_decode, log_encode
 from jaxtrapolate.records import GBuffer
@@ -254,7 +254,7 @@ def load_extranet(path: str | PathLike[str]) -> tuple[ExtraNet, Preparation]:
     if path.suffix != ".npz" and not path.is_dir():
         checkpoint = read_torch(path)
         try:
-            return from_torch(checkpoint.get("state_dict", checkpoint)), RELEASE
+            return extranet_from_torch(checkpoint.get("state_dict", checkpoint)), RELEASE
         except ValueError as error:
             raise ValueError(f"{path}: no weights of ExtraNet: {error}") from error
     weights = load_orbax(path) if path.is_dir() else load_weights(path)
