@@ -64,9 +64,9 @@ def test_all_operations_without_peers(operations, tmp_path, monkeypatch, capsys)
 @pytest.mark.parametrize(
     "module, names",
     [
-        ("cv2", "bilinear,warp nearest,bicubic,chain"),
-        ("scipy", "bilinear,warp nearest,chain"),
-        ("torch", "bilinear,warp nearest,bicubic"),
+        ("cv2", "warp bilinear,warp nearest,bicubic,chain"),
+        ("scipy", "warp bilinear,warp nearest,chain"),
+        ("torch", "warp bilinear,warp nearest,bicubic"),
         ("numba", "bicubic,softmax,occlusion,search,warp float32"),
     ],
 )
