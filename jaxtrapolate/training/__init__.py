@@ -1,7 +1,6 @@
 """Training: one loop for all networks, configured by TOML files; `jaxtrapolate train`."""
 
 from jaxtrapolate.training.checkpoints import model_arrays as model_arrays
-from jaxtrapolate.training.checkpoints import read_model as read_model
 from jaxtrapolate.training.config import Config as Config
 from jaxtrapolate.training.config import Optimizer as Optimizer
 from jaxtrapolate.training.config import config_names as config_names

@@ -1,7 +1,6 @@
 """Checkpoints that a kill at any moment leaves whole, and the trained weights."""
 
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -12,8 +11,6 @@ import numpy as np
 import orbax.checkpoint as ocp
 from flax import nnx
 from orbax.checkpoint import checkpoint_managers as policies
-
-from jaxtrapolate.files import InputError
 
 
 class Checkpoints:
@@ -75,20 +72,9 @@ def model_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
 def save_model(folder: Path, model: nnx.Module, *, about: Mapping[str, Any]) -> None:
     """Saves `model_arrays` as an Orbax checkpoint, in place of what was there; all hosts call it.
 
-    about: JSON that is saved with them. The checkpoint's items are "weights" and "metadata".
+    about: JSON that is saved with them. The checkpoint's items are "weights" and "metadata", as
+    `jaxtrapolate.weights.load_orbax` reads them.
     """
     items = {"weights": ocp.args.StandardSave(model_arrays(model)), "metadata": ocp.args.JsonSave(dict(about))}
     with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
         checkpointer.save(folder.absolute(), args=ocp.args.Composite(**items), force=True)
-
-
-def read_model(folder: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """The arrays that `save_model` saved, by name; raises `InputError` where there are none."""
-    path = Path(folder).absolute()
-    if not (path / "weights").is_dir():
-        raise InputError(f"{folder}: no trained model there; give the folder `model` of a workdir")
-    try:
-        with ocp.StandardCheckpointer() as checkpointer:
-            return checkpointer.restore(path / "weights")
-    except (ValueError, OSError) as error:
-        raise InputError(f"{folder}: no model that can be read ({' '.join(str(error).split())})") from error

@@ -37,10 +37,10 @@ def train_and_evaluate(
     """Trains a network as a configuration says, from a workdir's last checkpoint on; the last validation's scores.
 
     In the workdir: config.json; metrics.jsonl; checkpoints/, the last few and the best; images/ of each validation; at
-    the end model/, the (averaged) weights, see `read_model`. On one CPU a run that was killed and resumed gives the
-    same numbers bit for bit. It runs on all devices of all hosts that `jax.distributed` knows; these share the workdir,
-    and losses are the same on any number of devices but for rounding. A score that is not finite is None here and null
-    in metrics.jsonl.
+    the end model/, the (averaged) weights, which `jaxtrapolate.load` takes. On one CPU a run that was killed and
+    resumed gives the same numbers bit for bit. It runs on all devices of all hosts that `jax.distributed` knows; these
+    share the workdir, and losses are the same on any number of devices but for rounding. A score that is not finite is
+    None here and null in metrics.jsonl.
 
     Args:
         config: see `Config`.
