@@ -48,6 +48,6 @@ from jaxtrapolate.runs import motion_blur as motion_blur
 from jaxtrapolate.scatter import splat as splat
 from jaxtrapolate.scatter import splat_nearest as splat_nearest
 from jaxtrapolate.search import Correspondence as Correspondence
-from jaxtrapolate.search import dual_start as dual_start
 from jaxtrapolate.search import iterative_search as iterative_search
-from jaxtrapolate.search import latest_start as latest_start
+from jaxtrapolate.starts import dual_start as dual_start
+from jaxtrapolate.starts import latest_start as latest_start

@@ -14,9 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image, check_present
-from jaxtrapolate.gather import Filter, sample, weigh, where_finite
+from jaxtrapolate.gather import Filter, all_finite, sample, weigh, where_finite
 from jaxtrapolate.records import Keyframe, record, replace
 from jaxtrapolate.search import Correspondence, check_scalar, positions, within
+from jaxtrapolate.strips import by_strips, once, rows_of
 
 Shader = Callable[[Array], Array]
 DepthKind = Literal["metric", "ordinal"]
@@ -65,13 +66,18 @@ class Interpolation:
     offsets: Offsets | None = None
 
 
-def fetch_finite(image: Float[Array, "h w c"], at: Float[Array, "i j 2"], filter: Filter) -> Float[Array, "i j c"]:
-    """The image at finite positions; a pixel that is not finite does not spread to where it has no weight."""
+def fetch_finite(
+    image: Float[Array, "h w c"], at: Float[Array, "i j 2"], filter: Filter, finite: Array | None = None
+) -> Float[Array, "i j c"]:
+    """The image at finite positions; a pixel that is not finite does not spread to where it has no weight.
+
+    finite: what `all_finite` says of the image, where that is known.
+    """
 
     def look(product, image, at):
         return sample(image, at[..., 0], at[..., 1], filter=filter, product=product)
 
-    return look(None, image, at) if filter == "nearest" else where_finite(look, image, at)
+    return look(None, image, at) if filter == "nearest" else where_finite(look, image, at, finite)
 
 
 def blend(
@@ -97,9 +103,13 @@ def shown(
     at: Float[Array, "i j 2"],
     expected: Float[Array, "i j 1"],
     epsilon: Array,
+    finite: Array | None = None,
 ) -> Bool[Array, "i j 1"]:
-    """Whether a point of the expected depth is what a frame shows at `at`: inside, and its depth agrees."""
-    found = sample(depth, at[..., 0], at[..., 1]).astype(expected.dtype)
+    """Whether a point of the expected depth is what a frame shows at `at`: inside, and its depth agrees.
+
+    finite: what `all_finite` says of the depth, where that is known.
+    """
+    found = fetch_finite(depth, at, "bilinear", finite).astype(expected.dtype)
     return within(at, *depth.shape[:2])[..., None] & agree(found, expected, epsilon, "metric")
 
 
@@ -123,33 +133,42 @@ def check_target(target: Keyframe, *, size: Size) -> None:
         check_image(f"target.{name}", value, size=size, channels=channels)
 
 
+def _part(sources, top, rows: int, *, filter: Filter) -> Interpolation:
+    """Some rows of the frame, before shading."""
+    frames, target, alpha, epsilon = sources
+    depth, *flows = (rows_of(a, top, rows).astype(alpha.dtype) for a in target)
+    grid = positions(rows, depth.shape[1], alpha.dtype, top=top)
+    ways = []
+    for (color, buffer, finite), flow in zip(frames, flows, strict=True):
+        known = jnp.all(jnp.isfinite(flow), -1, keepdims=True)
+        flow = jnp.where(known, flow, 0)
+        at = grid + flow[..., :2]
+        there = fetch_finite(buffer, at, "bilinear", finite[1]).astype(alpha.dtype)
+        same = agree(there, depth + flow[..., 2:], epsilon, "metric")
+        seen = once(known & within(at, *buffer.shape[:2])[..., None] & same)
+        found = Correspondence(at, -flow[..., 2:], jnp.where(known, 0, jnp.inf).astype(alpha.dtype))
+        ways.append((fetch_finite(color, at, filter, finite[0]), seen, there, found))
+    (first, in_first, first_depth, forward), (second, in_second, second_depth, backward) = ways
+    closest = jnp.where(second_depth < first_depth, 1, 0).astype(alpha.dtype)  # closest-on-miss
+    one = jnp.where(in_first == in_second, closest, jnp.where(in_second, 1, 0).astype(alpha.dtype))
+    weight = jnp.where(in_first & in_second, alpha, one)
+    missed = ~(in_first | in_second)[..., 0]
+    case = jnp.where(missed, CASES.index("missed"), CASES.index("assisted")).astype(jnp.int32)
+    return Interpolation(blend(first, second, weight), weight, case, forward, backward, depth)
+
+
 @partial(jax.jit, static_argnames=("shader", "shade", "filter"))
 def _assisted(previous, next, target, alpha, epsilon, *, shader, shade, filter):
-    height, width, _ = previous.color.shape
     wide = jnp.promote_types(target.forward_flow.dtype, jnp.float32)
     alpha, epsilon = (jnp.asarray(a).astype(wide) for a in (alpha, epsilon))
-    depth = target.depth.astype(wide)
-    ways = []
-    for frame, flow in ((previous, target.backward_flow), (next, target.forward_flow)):
-        flow = flow.astype(wide)
-        finite = jnp.all(jnp.isfinite(flow), -1, keepdims=True)
-        flow = jnp.where(finite, flow, 0)
-        at = positions(height, width, wide) + flow[..., :2]
-        visible = finite & shown(frame.depth, at, depth + flow[..., 2:], epsilon)
-        there = sample(frame.depth, at[..., 0], at[..., 1]).astype(wide)
-        found = Correspondence(at, -flow[..., 2:], jnp.where(finite, 0, jnp.inf).astype(wide))
-        ways.append((fetch_finite(frame.color, at, filter), visible, there, found))
-    (first, in_first, first_depth, forward), (second, in_second, second_depth, backward) = ways
-    closest = jnp.where(second_depth < first_depth, 1, 0).astype(wide)  # closest-on-miss
-    one = jnp.where(in_first == in_second, closest, jnp.where(in_second, 1, 0).astype(wide))
-    weight = jnp.where(in_first & in_second, alpha, one)
-    color = blend(first, second, weight)
-    missed = ~(in_first | in_second)
-    color = color if shade is None else shade(color)
+    frames = tuple((f.color, f.depth, (all_finite(f.color), all_finite(f.depth))) for f in (previous, next))
+    sources = frames, (target.depth, target.backward_flow, target.forward_flow), alpha, epsilon
+    made = by_strips(partial(_part, filter=filter), target.depth.shape[0], sources)
+    color = made.color if shade is None else shade(made.color)
     if shader is not None:
-        color = jnp.where(missed, shader(missed[..., 0]).astype(color.dtype), color)
-    case = jnp.where(missed[..., 0], CASES.index("missed"), CASES.index("assisted")).astype(jnp.int32)
-    return Interpolation(color, weight, case, forward, backward, depth)
+        missed = made.case == CASES.index("missed")
+        color = jnp.where(missed[..., None], shader(missed).astype(color.dtype), color)
+    return replace(made, color=color)
 
 
 def interpolate_assisted(

@@ -7,7 +7,7 @@ well, the two colours are blended.
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import jax
 import jax.numpy as jnp
@@ -28,21 +28,27 @@ from jaxtrapolate.assisted import (
     shown,
 )
 from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image, check_present
-from jaxtrapolate.gather import Filter, sample
+from jaxtrapolate.gather import Filter, all_finite, inside, sample
 from jaxtrapolate.records import Keyframe, replace
 from jaxtrapolate.search import (
     Correspondence,
     FlowFilter,
+    Leads,
     Solver,
+    advance,
     check_flow,
     check_scalar,
     check_search,
-    dual_start,
-    latest_start,
+    leads,
+    missed,
+    missed_by,
+    plane,
     positions,
-    search,
+    solve,
     within,
 )
+from jaxtrapolate.starts import LatestOffsets, dual, latest
+from jaxtrapolate.strips import by_strips, once
 
 Start = Literal["default", "dual", "latest"]
 Choice = Literal["error", "depth"]
@@ -53,7 +59,7 @@ _EQUAL = 1e-3  # pixels: errors that differ by less do so by rounding
 
 
 class _Found(NamedTuple):
-    """One solution of a search `[H, W, ...]`: place, whole flow and error there, depth in the frame to be made, hit."""
+    """One solution of a search `[rows, W, ...]`: place, whole flow, error, depth in the frame to be made, hit."""
 
     at: Array
     flow: Array
@@ -76,67 +82,109 @@ class _Options(NamedTuple):
     reach: int
 
 
-def _choose(best: _Found, other: _Found, choice: Choice) -> Array:
-    """Where the other solution is better: the smaller error (5.3), inside the frame first; or nearer, if both hit."""
-    closer = other.error < best.error - _EQUAL
-    if choice == "depth":
-        closer = jnp.where(other.hit & best.hit, other.depth < best.depth, closer)
-    height, width = other.at.shape[:2]
-    inner, best_inner = (within(f.at, height, width)[..., None] for f in (other, best))
-    return jnp.where(inner == best_inner, closer, inner)
+class _Side(NamedTuple):
+    """What there is of one I-frame, all rows.
+
+    passed: the depth `[H, W]` of its points in the frame to be made. leads: of its flow toward the other I-frame.
+    finite: whether the colours and the depths are. latest: what the frame made last leaves.
+    """
+
+    color: Array
+    depth: Array | None
+    passed: Array | None
+    leads: Leads
+    finite: tuple[Array, Array | None]
+    latest: LatestOffsets | None
+
+    @property
+    def flow(self) -> Array:
+        return self.leads.flow
+
+    @property
+    def fraction(self) -> Array:
+        return self.leads.fraction
+
+    @property
+    def size(self) -> Size:
+        """`(H, W)`."""
+        return self.flow.shape[0], self.flow.shape[1]
 
 
-def _find(frame, flow, fraction, starts, epsilon, options: _Options) -> _Found:
-    """The best solution of all starts in one I-frame."""
-    height, width, channels = flow.shape
-
-    def solve(start):
-        how = {"iterations": options.iterations, "solver": options.solver, "filter": options.flow_filter}
-        at, value, error = search(flow, fraction, start, **how)
-        hit = (error < epsilon) & within(at, height, width)[..., None]
-        depth = jnp.zeros_like(error)
-        if options.depth != "absent":
-            # from the same pixels as the flow, whose change of depth is theirs
-            depth = sample(frame.depth, at[..., 0], at[..., 1], filter=options.flow_filter).astype(at.dtype)
-        if options.depth == "metric" and channels == 3:
-            depth = depth + fraction * value[..., 2:]  # eq. 6 and 11
-        return _Found(at, value, error, jnp.where(jnp.isnan(depth), jnp.inf, depth), hit)
-
-    def step(best, given):
-        first, start = given
-        found = solve(start)
-        better = first | _choose(best, found, options.choice)
-        return _Found(*(jnp.where(better, a, b) for a, b in zip(found, best, strict=True))), None
-
-    number = len(starts)
-    empty = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(solve, starts[0]))
-    # a loop, because XLA on a CPU would make every solution anew for each that is compared with it
-    return jax.lax.scan(step, empty, (jnp.arange(number) == 0, jnp.stack(starts)))[0]
-
-
-def _starts(options: _Options, fraction, opposite, offset, depth, ratio):
-    """Positions to start from (5.3)."""
-    grid = positions(opposite.shape[0], opposite.shape[1], opposite.dtype)
-    places = []
+def _starts(side: _Side, other: _Side, top, rows: int, options: _Options) -> list[Array | None]:
+    """Positions to start from (5.3), complex planes, `None` for the pixels themselves."""
+    places: list[Array | None] = []
     for name in options.starts:
         if name == "default":
-            places.append(grid)
+            places.append(None)
         elif name == "dual":
-            places.append(dual_start(opposite, fraction))
-        elif offset is not None:
-            places.append(latest_start(offset, ratio, depth=depth, reach=options.reach).astype(grid.dtype))
-    return places or [grid]
+            places.append(dual(other.flow, side.fraction, top, rows))
+        elif side.latest is not None:
+            places.append(latest(side.latest, top, rows, reach=options.reach))
+    return places or [None]
 
 
-def _visible_in(other, opposite, found: _Found, fraction, epsilon_depth, epsilon_trip, options: _Options):
+def _best(sources, top, rows: int, *, options: _Options) -> Array:
+    """Where the best solution of all starts is in one I-frame, a complex plane.
+
+    The smaller error (5.3), inside the frame first; or the nearer, if both hit.
+    """
+    side, other, epsilon = sources
+    starts = _starts(side, other, top, rows, options)
+
+    def found(start):
+        return advance(side.leads, start, top, rows, options.iterations, options.solver, options.flow_filter)
+
+    if len(starts) == 1:
+        return found(starts[0])
+
+    def step(best, given):
+        at = found(given[1])
+        error = missed(side.leads, at, top, options.flow_filter)
+        depth = jnp.zeros_like(error)
+        if side.passed is not None and options.choice == "depth":
+            depth = sample(side.passed[..., None], at.real, at.imag, filter=options.flow_filter)[..., 0]
+        best_at, best_error, best_depth = best
+        closer = error < best_error - _EQUAL
+        inner, best_inner = (inside(place.real, place.imag, *side.size) for place in (at, best_at))
+        if options.choice == "depth":
+            hits = inner & (error < epsilon), best_inner & (best_error < epsilon)
+            closer = jnp.where(hits[0] & hits[1], depth < best_depth, closer)
+        better = given[0] | jnp.where(inner == best_inner, closer, inner)
+        return tuple(jnp.where(better, a, b) for a, b in zip((at, error, depth), best, strict=True)), None
+
+    grid = plane(positions(rows, side.size[1], side.flow.dtype, top=top))
+    starts = jnp.stack([grid if start is None else start for start in starts])
+    none = jnp.zeros(grid.shape, side.flow.dtype)
+    # a loop, because XLA on a CPU would make every solution anew for each that is compared with it
+    return jax.lax.scan(step, (grid, none, none), (jnp.arange(len(starts)) == 0, starts))[0][0]
+
+
+def _find(side: _Side, other: _Side, epsilon, top, rows: int, options: _Options) -> _Found:
+    """The best solution of all starts in one I-frame."""
+    sources = jax.lax.stop_gradient((side, other, epsilon))
+    best = partial(_best, options=options)
+    at = by_strips(best, rows, sources) if rows == side.size[0] else best(sources, top, rows)
+    at, value = solve(side.leads, at, top, rows, 0, options.solver, options.flow_filter)
+    value, error = missed_by(at, value, side.fraction, positions(rows, side.size[1], side.flow.dtype, top=top))
+    hit = (error < epsilon) & within(at, *side.size)[..., None]
+    depth = jnp.zeros_like(error)
+    if side.depth is not None:
+        # from the same pixels as the flow, whose change of depth is theirs
+        depth = sample(side.depth, at[..., 0], at[..., 1], filter=options.flow_filter).astype(at.dtype)
+    if options.depth == "metric" and side.flow.shape[2] == 3:
+        depth = depth + side.fraction * value[..., 2:]  # eq. 6 and 11
+    return _Found(at, value, error, jnp.where(jnp.isnan(depth), jnp.inf, depth), hit)
+
+
+def _visible_in(other: _Side, found: _Found, epsilon_depth, epsilon_trip, options: _Options):
     """Whether a point found in one I-frame is seen in the other (5.2): its place there, and the answer `[H, W, 1]`."""
     there = found.at + found.flow[..., :2]
-    seen = within(there, *other.color.shape[:2])[..., None] & (found.error < jnp.inf)
+    seen = within(there, *other.size)[..., None] & (found.error < jnp.inf)
     if options.visibility == "depth":
-        expected = found.depth + (1 - fraction) * found.flow[..., 2:]
-        seen &= shown(other.depth, there, expected, epsilon_depth)
+        expected = found.depth + other.fraction * found.flow[..., 2:]  # the rest of the way
+        seen &= shown(cast(Array, other.depth), there, expected, epsilon_depth, other.finite[1])
     elif options.visibility == "round_trip":
-        back = sample(opposite, there[..., 0], there[..., 1], filter=options.flow_filter).astype(there.dtype)
+        back = sample(other.flow, there[..., 0], there[..., 1], filter=options.flow_filter).astype(there.dtype)
         apart = found.flow[..., :2] + back[..., :2]
         seen &= jnp.sum(jnp.square(apart), -1, keepdims=True) < jnp.square(epsilon_trip)
     return there, seen
@@ -147,64 +195,78 @@ def _ratio(now, then):
     return jnp.where(then > 0, now / jnp.where(then > 0, then, 1), 0)
 
 
-@partial(jax.jit, static_argnames=("options", "shade"))
-def _interpolate(previous, next, alpha, offsets, epsilon_error, epsilon_depth, epsilon_trip, *, options, shade):
-    flow, opposite = previous.forward_flow, next.backward_flow
-    height, width, channels = flow.shape
-    wide = jnp.promote_types(jnp.promote_types(flow.dtype, opposite.dtype), jnp.float32)
-    flow, opposite = flow.astype(wide), opposite.astype(wide)
-    numbers = (alpha, epsilon_error, epsilon_depth, epsilon_trip)
-    alpha, epsilon_error, epsilon_depth, epsilon_trip = (jnp.asarray(a).astype(wide) for a in numbers)
-    beta = 1 - alpha
-    carried = (None,) * 6
-    if offsets is not None:
-        last = offsets.alpha.astype(wide)
-        carried = (offsets.forward, offsets.forward_depth, _ratio(alpha, last))
-        carried += (offsets.backward, offsets.backward_depth, _ratio(beta, 1 - last))
-    forward_starts = _starts(options, alpha, opposite, *carried[:3])
-    backward_starts = _starts(options, beta, flow, *carried[3:])
-    f = _find(previous, flow, alpha, forward_starts, epsilon_error, options)
-    b = _find(next, opposite, beta, backward_starts, epsilon_error, options)
+def _part(sources, top, rows: int, *, options: _Options) -> tuple[Interpolation, tuple[Array | None, ...]]:
+    """Some rows of the frame, before shading and without its offsets; and those but for alpha."""
+    previous, next, epsilon_error, epsilon_depth, epsilon_trip = sources
+    alpha, size = previous.fraction, previous.size
+    f = _find(previous, next, epsilon_error, top, rows, options)
+    b = _find(next, previous, epsilon_error, top, rows, options)
 
     # 5.2: which of the two points is the one to be seen
     same = jnp.ones_like(f.hit)
     if options.depth != "absent":
         same = agree(f.depth, b.depth, epsilon_depth, options.depth)
-    f_inside, b_inside = (within(a.at, height, width)[..., None] for a in (f, b))
+    f_inside, b_inside = (within(a.at, *size)[..., None] for a in (f, b))
     apart = f.error - b.error
     smaller = jnp.where(jnp.abs(apart) < _EQUAL, alpha < 0.5, apart < 0)
     smaller = jnp.where(f_inside == b_inside, smaller, f_inside)
     by_error = jnp.where(f.hit == b.hit, smaller, f.hit)
     take_f = jnp.where(f.hit & b.hit & ~same, f.depth < b.depth, by_error)
-    take_f = jnp.where(alpha == 0, True, jnp.where(alpha == 1, False, take_f))
+    take_f = once(jnp.where(alpha == 0, True, jnp.where(alpha == 1, False, take_f)))
     case = jnp.where(same, CASES.index("agree"), CASES.index("nearer"))
     case = jnp.where(f.hit & b.hit, case, jnp.where(f.hit | b.hit, CASES.index("one"), CASES.index("neither")))
 
     # eq. 14 and 15: that point in both I-frames, blended where both show it
-    f_there, f_seen = _visible_in(next, opposite, f, alpha, epsilon_depth, epsilon_trip, options)
-    b_there, b_seen = _visible_in(previous, flow, b, beta, epsilon_depth, epsilon_trip, options)
+    f_there, f_seen = _visible_in(next, f, epsilon_depth, epsilon_trip, options)
+    b_there, b_seen = _visible_in(previous, b, epsilon_depth, epsilon_trip, options)
     first, second = jnp.where(take_f, f.at, b_there), jnp.where(take_f, f_there, b.at)
-    both = jnp.where(take_f, f_seen, b_seen)
-    weight = jnp.where(both, alpha, jnp.where(take_f, 0, 1).astype(wide))
+    both = once(jnp.where(take_f, f_seen, b_seen))
+    weight = jnp.where(both, alpha, jnp.where(take_f, 0, 1).astype(alpha.dtype))
     first_color, second_color = (
-        fetch_finite(frame.color, at, options.filter) for frame, at in ((previous, first), (next, second))
+        fetch_finite(side.color, at, options.filter, side.finite[0]) for side, at in ((previous, first), (next, second))
     )
     color = blend(first_color, second_color, weight)
-    color = color if shade is None else shade(color)
 
-    grid = positions(height, width, wide)
+    grid = positions(rows, size[1], alpha.dtype, top=top)
     known = options.depth != "absent"
-    left = Offsets(
-        alpha,
-        grid - f.at,
-        grid - b.at,
-        jnp.where(f.hit, f.depth, jnp.inf) if known else None,
-        jnp.where(b.hit, b.depth, jnp.inf) if known else None,
+    left = [grid - a.at for a in (f, b)] + [jnp.where(a.hit, a.depth, jnp.inf) if known else None for a in (f, b)]
+    forward, backward = (
+        Correspondence(a.at, side.fraction * a.flow[..., 2:] if side.flow.shape[2] == 3 else None, a.error)
+        for a, side in ((f, previous), (b, next))
     )
-    forward = Correspondence(f.at, alpha * f.flow[..., 2:] if channels == 3 else None, f.error)
-    backward = Correspondence(b.at, beta * b.flow[..., 2:] if opposite.shape[2] == 3 else None, b.error)
     depth = jnp.where(take_f, f.depth, b.depth) if known else None
-    return Interpolation(color, weight, case[..., 0].astype(jnp.int32), forward, backward, depth, left)
+    return Interpolation(color, weight, case[..., 0].astype(jnp.int32), forward, backward, depth), tuple(left)
+
+
+@partial(jax.jit, static_argnames=("options", "shade"))
+def _interpolate(previous, next, alpha, offsets, epsilon_error, epsilon_depth, epsilon_trip, *, options, shade):
+    flow, opposite = previous.forward_flow, next.backward_flow
+    wide = jnp.promote_types(jnp.promote_types(flow.dtype, opposite.dtype), jnp.float32)
+    numbers = (alpha, epsilon_error, epsilon_depth, epsilon_trip)
+    alpha, *epsilons = (jnp.asarray(a).astype(wide) for a in numbers)
+
+    def side(frame, flow, fraction, offset, last_depth, last):
+        flow, known = flow.astype(wide), None
+        if offset is not None:
+            known = LatestOffsets(offset.astype(wide), last_depth, _ratio(fraction, last))
+        depth, passed = None if options.depth == "absent" else frame.depth, None
+        if depth is not None:
+            passed = depth[..., 0].astype(wide)
+            if options.depth == "metric" and flow.shape[2] == 3:
+                change = flow[..., 2]
+                passed = passed + fraction * jnp.where(jnp.isfinite(change), change, 0)
+            passed = jnp.where(jnp.isnan(passed), jnp.inf, passed)
+        finite = all_finite(frame.color), None if depth is None else all_finite(depth)
+        return _Side(frame.color, depth, passed, leads(flow, fraction), finite, known)
+
+    lasts = (None, None, None), (None, None, None)
+    if offsets is not None:
+        last = offsets.alpha.astype(wide)
+        lasts = (offsets.forward, offsets.forward_depth, last), (offsets.backward, offsets.backward_depth, 1 - last)
+    sources = side(previous, flow, alpha, *lasts[0]), side(next, opposite, 1 - alpha, *lasts[1]), *epsilons
+    made, left = by_strips(partial(_part, options=options), flow.shape[0], sources)
+    color = made.color if shade is None else shade(made.color)
+    return replace(made, color=color, offsets=Offsets(alpha, *left))
 
 
 def _checked(previous: Keyframe, next: Keyframe) -> Size:

@@ -6,12 +6,13 @@ Convention:
     -0.5 <= x <= W - 0.5. Between the outermost centres and the frame's edge the border value is repeated.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Shaped
+from jaxtyping import Array, Bool, Float, Inexact, Shaped
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image
 
@@ -64,7 +65,7 @@ def take_rows(rows: Shaped[Array, "n c"], index: Array) -> Array:
 
 
 def take_offsets(
-    image: Float[Array, "h w c"], row: Array, column: Array, offsets: list[tuple[int, int]]
+    image: Inexact[Array, "h w c"], row: Array, column: Array, offsets: list[tuple[int, int]]
 ) -> list[Array]:
     """image[row + j, column + i] for each offset (j, i) >= 0, where all of those are in bounds.
 
@@ -99,24 +100,36 @@ def _weigh_jvp(primals, tangents):
     return weigh(value, weight), used * d_weight + d_value * weight
 
 
-def where_finite(function, image, motion):
+def all_finite(image):
+    """Whether an image may be weighted with the plain product; an overflow of the sum only takes the slower way."""
+    return jnp.isfinite(jnp.sum(image))
+
+
+def where_finite(function, image, motion, finite=None):
     """function(product, image, motion), with the plain product for weighting where the image allows it.
 
     `weigh` costs half as much again as a product on a CPU, and only a non-finite pixel needs it. So there the image is
-    looked through first, at the price of one pass; elsewhere `weigh` is free and is always taken.
+    looked through first, at the price of one pass, unless `finite` is what `all_finite` said of it; elsewhere `weigh`
+    is free and is always taken.
     """
 
-    def on_cpu(image, motion):
-        finite = jnp.isfinite(jnp.sum(image))  # an overflow of the sum only takes the slower way
+    def on_cpu(image, motion, finite):
+        finite = all_finite(image) if finite is None else finite
         return jax.lax.cond(finite, partial(function, _plain), partial(function, weigh), image, motion)
 
-    return jax.lax.platform_dependent(image, motion, cpu=on_cpu, default=partial(function, weigh))
+    def always(image, motion, _):
+        return function(weigh, image, motion)
+
+    return jax.lax.platform_dependent(image, motion, finite, cpu=on_cpu, default=always)
 
 
 def _nearest(product, image, x, y):
     height, width, channels = image.shape
-    column = jnp.clip(jnp.floor(jax.lax.stop_gradient(x) + 0.5), 0, width - 1).astype(jnp.int32)
-    row = jnp.clip(jnp.floor(jax.lax.stop_gradient(y) + 0.5), 0, height - 1).astype(jnp.int32)
+    # held to the frame first, so that cutting off rounds to the nearest
+    column, row = (
+        (jnp.clip(jax.lax.stop_gradient(v), 0, size - 1) + 0.5).astype(jnp.int32)
+        for v, size in ((x, width), (y, height))
+    )
     return take_rows(image.reshape(-1, channels), row * width + column)
 
 
@@ -125,12 +138,13 @@ def _bilinear(product, image, x, y):
     column, t = cell(x, width)
     row, u = cell(y, height)
     t, u = t[..., None], u[..., None]
-    wide = jnp.promote_types(image.dtype, x.dtype)
+    real = jnp.promote_types(jnp.finfo(image.dtype).dtype, x.dtype)
+    wide = jnp.result_type(image.dtype) if jnp.iscomplexobj(image) else real
     right, down = int(width > 1), int(height > 1)
     taps = take_offsets(image, row, column, [(0, 0), (0, right), (down, 0), (down, right)])
     # a (1 - t) + b t returns a tap bit for bit at t = 0 and t = 1; a + t (b - a) does not
     weights = [(1 - t) * (1 - u), t * (1 - u), (1 - t) * u, t * u]
-    a, b, c, d = (product(tap.astype(wide), weight.astype(wide)) for tap, weight in zip(taps, weights, strict=False))
+    a, b, c, d = (product(tap.astype(wide), weight.astype(real)) for tap, weight in zip(taps, weights, strict=False))
     return (a + b) + (c + d)
 
 
@@ -165,11 +179,18 @@ def _bicubic(product, image, x, y):
 _SAMPLERS = {"nearest": _nearest, "bilinear": _bilinear, "bicubic": _bicubic}
 
 
-def sample(image: Float[Array, "h w c"], x: Array, y: Array, *, filter: Filter = "bilinear", product=weigh) -> Array:
+def sample(
+    image: Inexact[Array, "h w c"],
+    x: Array,
+    y: Array,
+    *,
+    filter: Filter = "bilinear",
+    product: Callable | None = weigh,
+) -> Array:
     """The image at finite positions x, y of any common shape; beyond the frame the edge is repeated.
 
-    The filter, exactness and gradients are those of `backward_warp`, of which this is the core. `product` may be a
-    plain product where the image is known to be finite.
+    The filter, exactness and gradients are those of `backward_warp`, of which this is the core. `product` (value, real
+    weight) may be a plain product where the image is known to be finite, and is one of its own for a complex image.
     """
     return _SAMPLERS[filter](product, image, x, y).astype(image.dtype)
 

@@ -11,22 +11,22 @@ Convention:
 import dataclasses
 import operator
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image
-from jaxtrapolate.gather import inside, pixel_grid, sample, weigh
+from jaxtrapolate.gather import all_finite, inside, pixel_grid, sample, where_finite
 from jaxtrapolate.records import record
+from jaxtrapolate.strips import by_strips, rows_of
 
 Solver = Literal["fixed_point", "newton"]
 FlowFilter = Literal["bilinear", "nearest"]
 
 _LEAST = 0.1  # of a determinant relative to its matrix: no inverse stretches a vector more than 1 / _LEAST times
 _STEEPEST = 1e4  # pixels per pixel
-_STRIP = 16  # rows
 
 
 @record
@@ -45,9 +45,10 @@ class Correspondence:
     error: Float[Array, "h w 1"]
 
 
-def positions(height: int, width: int, dtype=jnp.float32) -> Float[Array, "h w 2"]:
-    """x and y of the pixel centres."""
+def positions(height: int, width: int, dtype=jnp.float32, *, top: Array | int = 0) -> Float[Array, "h w 2"]:
+    """x and y of the pixel centres of `height` rows from row `top` on."""
     x, y = pixel_grid(height, width, dtype)
+    y = y + jnp.asarray(top).astype(dtype)
     return jnp.stack([jnp.broadcast_to(x, (height, width)), jnp.broadcast_to(y, (height, width))], -1)
 
 
@@ -84,57 +85,118 @@ def _divide(vector, by_x, by_y, fraction):
     return jnp.stack([d * x - b * y, a * y - c * x], -1) / determinant[..., None]
 
 
-def _step(flow, fraction, pixels, at, solver, filter):
-    if solver == "fixed_point":
-        return pixels - fraction * fetch(flow, at, filter)  # eq. 5
-    value, by_x, by_y = _slopes(flow, at, filter)
-    return at - _divide(at + fraction * value - pixels, by_x, by_y, fraction)
-
-
 def _finite(flow):
     """Whether x and y are, `[..., 1]`."""
     return jnp.isfinite(flow[..., :1]) & jnp.isfinite(flow[..., 1:2])
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(3, 4, 5))
-def _solve(flow, fraction, start, iterations, solver, filter):
-    """After all steps the position `[H, W, 2]`, and the whole flow there `[H, W, C]`; NaN where that is not finite."""
-    height, width, _ = flow.shape
-    lead = jnp.where(_finite(flow), flow[..., :2], 0)
-
-    def search(pixels, at):
-        def step(at, _):
-            return _step(lead, fraction, pixels, at, solver, filter), None
-
-        at, _ = jax.lax.scan(step, at, None, length=iterations)  # a loop: unrolled, each step would compute all before
-        return at, sample(flow, at[..., 0], at[..., 1], filter=filter, product=weigh)
-
-    def whole(start):
-        return search(positions(height, width, flow.dtype), start)
-
-    def in_strips(start):
-        # on a CPU one output for both components, and strips that stay in the cache, halve the time
-        strips = -(-height // _STRIP)
-        split = jnp.pad(start, ((0, strips * _STRIP - height), (0, 0), (0, 0))).reshape(strips, _STRIP, width, 2)
-        grid = positions(_STRIP, width, flow.dtype)
-
-        def strip(given):
-            top, at = given
-            return search(grid + jnp.stack([jnp.zeros_like(top), top])[None, None], at)
-
-        found = jax.lax.map(strip, (_STRIP * jnp.arange(strips, dtype=flow.dtype), split))
-        return tuple(a.reshape(strips * _STRIP, width, -1)[:height] for a in found)
-
-    if height <= _STRIP:
-        return whole(start)
-    return jax.lax.platform_dependent(start, cpu=in_strips, default=whole)
+def plane(pair: Array) -> Array:
+    """Two components `[..., 2]` as complex numbers: on a CPU one load serves both, and one loop makes both."""
+    return jax.lax.complex(pair[..., 0], pair[..., 1])
 
 
-@_solve.defjvp
-def _solve_jvp(iterations, solver, filter, primals, tangents):
+def pair(plane: Array) -> Array:
+    """The components `[..., 2]` of complex numbers."""
+    return jnp.stack([plane.real, plane.imag], -1)
+
+
+def scaled(value, weight):
+    """A complex value by a real weight; as one product, so that XLA on a CPU keeps all in one loop."""
+    return value * jax.lax.complex(weight, jnp.zeros_like(weight))
+
+
+def _weighed(value, weight):
+    """As `scaled`, but 0 where the weight is 0, also of a value that is not finite."""
+    return jnp.where(weight == 0, 0, scaled(value, weight))
+
+
+class Leads(NamedTuple):
+    """What a search needs of a rendered frame, all rows.
+
+    flow `[H, W, C]`, at least float32; fraction of it that passes; finite: whether all of it is; passing: x and y of
+    fraction * flow, a complex plane; known: the same, 0 where it is not finite.
+    """
+
+    flow: Array
+    fraction: Array
+    finite: Array
+    passing: Array
+    known: Array
+
+
+def leads(flow: Float[Array, "h w c"], fraction: Array) -> Leads:
+    """The `Leads` of a flow."""
+    passing = plane(jax.lax.stop_gradient(fraction * flow[..., :2]))
+    return Leads(flow, fraction, all_finite(flow), passing, only_finite(passing))
+
+
+def only_finite(value):
+    """A complex value, 0 where it is not finite."""
+    return jnp.where(jnp.isfinite(value.real) & jnp.isfinite(value.imag), value, 0)
+
+
+def _looked(plane, at, filter, product=None):
+    """A complex plane at complex positions."""
+    return sample(plane[..., None], at.real, at.imag, filter=filter, product=product)[..., 0]
+
+
+def advance(leads: Leads, start: Array | None, top, rows: int, iterations: int, solver: Solver, filter: FlowFilter):
+    """Complex positions `[rows, W]` after all steps from a start, `None` for the pixels themselves; no gradient."""
+    pixels = plane(positions(rows, leads.flow.shape[1], leads.flow.dtype, top=top))
+
+    def fixed_point(at, _):  # eq. 5
+        if filter == "nearest":  # a plane less in memory
+            return pixels - only_finite(_looked(leads.passing, at, filter)), None
+        return pixels - _looked(leads.known, at, filter, product=scaled), None
+
+    def newton(at, _):
+        at = pair(at)
+        value, by_x, by_y = _slopes(pair(leads.known), at, filter)
+        return plane(at - _divide(at + value - pair(pixels), by_x, by_y, 1)), None
+
+    at = pixels if start is None else start
+    if start is None and solver == "fixed_point" and iterations > 0:  # the flow at a pixel itself needs no search
+        at, iterations = pixels - only_finite(rows_of(leads.passing, top, rows)), iterations - 1
+    # a loop: unrolled, each step would compute all before
+    step = newton if solver == "newton" else fixed_point
+    return jax.lax.stop_gradient(jax.lax.scan(step, at, None, length=iterations)[0])
+
+
+def missed(leads: Leads, at: Array, top, filter: FlowFilter) -> Array:
+    """The error `[rows, W]` (eq. 7) of complex positions; infinite where the flow is not finite; no gradient."""
+    pixels = plane(positions(at.shape[0], at.shape[1], leads.flow.dtype, top=top))
+    apart = at + _looked(leads.passing, at, filter, product=_weighed) - pixels
+    error = jnp.sqrt(apart.real * apart.real + apart.imag * apart.imag)
+    return jnp.where(jnp.isnan(error), jnp.inf, error)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(3, 4, 5, 6))
+def solve(leads, start, top, rows, iterations, solver, filter):
+    """For `rows` rows from `top` on: position `[rows, W, 2]`, and the whole flow there; NaN where that is not finite.
+
+    start: complex `[rows, W]`, or `None` for the pixels themselves.
+    """
+    at = pair(advance(leads, start, top, rows, iterations, solver, filter))
+
+    def look(product, flow, at):
+        return sample(flow, at[..., 0], at[..., 1], filter=filter, product=product)
+
+    return at, look(None, leads.flow, at) if filter == "nearest" else where_finite(look, leads.flow, at, leads.finite)
+
+
+def _solve_part(sources, top, rows, *, iterations, solver, filter):
+    leads, start = sources
+    start = None if start is None else rows_of(start, top, rows)
+    return solve(leads, start, top, rows, iterations, solver, filter)
+
+
+@solve.defjvp
+def _solve_jvp(rows, iterations, solver, filter, primals, tangents):
     """Of the solution of at + fraction flow(at) = pixel, whatever led to it: the start has no part in it."""
-    (flow, fraction, _), (d_flow, d_fraction, _) = primals, tangents
-    at, value = _solve(*primals, iterations, solver, filter)
+    (leads, start, _), ((d_flow, d_fraction, *_), *_) = primals, tangents
+    part = partial(_solve_part, iterations=iterations, solver=solver, filter=filter)
+    at, value = by_strips(part, rows, (leads, start))  # all rows: see `by_strips`
+    flow, fraction = leads.flow, leads.fraction
     known = _finite(flow) & jnp.isfinite(flow)
     here, by_x, by_y = _slopes(jnp.where(known, flow, 0), at, filter)
     moved = fetch(jnp.where(known, d_flow, 0), at, filter)
@@ -142,20 +204,33 @@ def _solve_jvp(iterations, solver, filter, primals, tangents):
     return (at, value), (d_at, moved + by_x * d_at[..., :1] + by_y * d_at[..., 1:])
 
 
-@partial(jax.jit, static_argnames=("iterations", "solver", "filter"))
-def search(flow, fraction, start, *, iterations, solver, filter):
-    """`iterative_search` without its checks: (position, the whole flow there, error)."""
-    wide = jnp.promote_types(flow.dtype, jnp.float32)
-    pixels = positions(flow.shape[0], flow.shape[1], wide)
-    start = pixels if start is None else jnp.where(_finite(start), start, pixels.astype(start.dtype)).astype(wide)
-    fraction = jnp.asarray(fraction).astype(wide)
-    at, value = _solve(flow.astype(wide), fraction, jax.lax.stop_gradient(start), iterations, solver, filter)
+def missed_by(at, value, fraction, pixels) -> tuple[Array, Array]:
+    """The whole flow at the positions found, 0 where it is not finite; and the error (eq. 7)."""
     known = jnp.where(jnp.isfinite(value), value, 0)
     x, y = (at[..., k] + fraction * known[..., k] - pixels[..., k] for k in (0, 1))
     square = (x * x + y * y)[..., None]
     usual = (square > 0) & (square < jnp.inf) & _finite(value)
     error = jnp.where(usual, jnp.sqrt(jnp.where(usual, square, 1)), jnp.where(square == 0, 0, jnp.inf))
-    return at, known, jnp.where(_finite(value), error, jnp.inf)
+    return known, jnp.where(_finite(value), error, jnp.inf)
+
+
+def _search_part(sources, top, rows, *, iterations, solver, filter):
+    at, value = _solve_part(sources, top, rows, iterations=iterations, solver=solver, filter=filter)
+    flow, fraction = sources[0].flow, sources[0].fraction
+    known, error = missed_by(at, value, fraction, positions(rows, flow.shape[1], flow.dtype, top=top))
+    return at, fraction * known[..., 2:], error
+
+
+@partial(jax.jit, static_argnames=("iterations", "solver", "filter"))
+def _search(flow, fraction, start, *, iterations, solver, filter):
+    """`iterative_search` without its checks."""
+    wide = jnp.promote_types(flow.dtype, jnp.float32)
+    flow, fraction = flow.astype(wide), jnp.asarray(fraction).astype(wide)
+    if start is not None:
+        pixels = positions(flow.shape[0], flow.shape[1], wide)
+        start = plane(jax.lax.stop_gradient(jnp.where(_finite(start), start, pixels.astype(start.dtype)).astype(wide)))
+    part = partial(_search_part, iterations=iterations, solver=solver, filter=filter)
+    return by_strips(part, flow.shape[0], (leads(flow, fraction), start))
 
 
 def check_flow(name: str, flow: Any, *, size: tuple[int, int] | None = None) -> tuple[int, int]:
@@ -240,89 +315,5 @@ def iterative_search(
         check_image("start", start, size=size, channels=2)
     check_scalar("fraction", fraction)
     check_search(iterations=iterations, solver=solver, filter=filter)
-    at, value, error = search(flow, fraction, start, iterations=iterations, solver=solver, filter=filter)
-    offset = jnp.asarray(fraction).astype(value.dtype) * value[..., 2:] if flow.shape[2] == 3 else None
-    return Correspondence(at, offset, error)
-
-
-def dual_start(flow: Float[ArrayLike, "h w c"], fraction: float | Float[ArrayLike, ""]) -> Float[Array, "h w 2"]:
-    """Where to start a search from by the opposite frame's flow: p + fraction * flow(p).
-
-    It finds a moving object past its silhouette, where the frame searched shows the background at p.
-
-    Args:
-        flow: `[H, W, 3]` or `[H, W, 2]` of the other I-frame, toward the one that is searched.
-        fraction: of the search: alpha in the frame before, with the backward flow of the one after, and vice versa.
-
-    Returns:
-        `[H, W, 2]`, at least float32; the pixel itself where the flow is not finite. No gradient passes a start.
-
-    Raises:
-        TypeError, ValueError: no floating-point array, a shape that does not fit.
-
-    References:
-        Yang et al. 2011, section 5.3, equations 16 and 17.
-    """
-    height, width = check_flow("flow", flow)
-    check_scalar("fraction", fraction)
-    wide = jnp.promote_types(flow.dtype, jnp.float32)
-    motion = flow[..., :2].astype(wide)
-    motion = jnp.where(jnp.all(jnp.isfinite(motion), -1, keepdims=True), motion, 0)
-    return positions(height, width, wide) + jnp.asarray(fraction).astype(wide) * motion
-
-
-def _nearest_of(depth, values, reach, axis):
-    """Along one axis, depth and values where the depth is least within `reach`; ties keep the pixel, then the first."""
-    size = depth.shape[axis]
-    padding = [(0, 0)] * 3
-    padding[axis] = (reach, reach)
-    far, around = jnp.pad(depth, padding, constant_values=jnp.inf), jnp.pad(values, padding)
-
-    def look(best, k):
-        there, value = (jax.lax.dynamic_slice_in_dim(a, k, size, axis=axis) for a in (far, around))
-        closer = there < best[0]
-        return (jnp.where(closer, there, best[0]), jnp.where(closer, value, best[1])), None
-
-    others = jnp.asarray([k for k in range(2 * reach + 1) if k != reach], jnp.int32)
-    return jax.lax.scan(look, (depth, values), others)[0]
-
-
-def latest_start(
-    offset: Float[ArrayLike, "h w 2"],
-    ratio: float | Float[ArrayLike, ""],
-    *,
-    depth: Float[ArrayLike, "h w 1"] | None = None,
-    reach: int = 1,
-) -> Float[Array, "h w 2"]:
-    """Where to start a search from by the frame made last: p - ratio * offset, that of the nearest surface around.
-
-    Args:
-        offset: `[H, W, 2]`, p - position of the search in the same I-frame for the frame made last.
-        ratio: alpha / alpha' in the I-frame before, (1 - alpha) / (1 - alpha') in the one after; alpha' of that frame.
-        depth: `[H, W, 1]` that the points had in that frame, smaller is nearer; infinite or NaN where the search missed
-            and should not be followed. Without it each pixel keeps its own offset.
-        reach: the neighbourhood is a square of 2 reach + 1 pixels; 0 = the pixel itself.
-
-    Returns:
-        `[H, W, 2]`; the pixel itself where the offset is not finite. Ties keep the pixel's own column or row.
-
-    Raises:
-        TypeError, ValueError: no floating-point array, a shape or option that does not fit.
-
-    References:
-        Yang et al. 2011, section 5.3, equations 18 and 19. Departure: offsets of searches that missed are left out,
-        where the caller says so by their depth.
-    """
-    height, width = check_image("offset", offset, channels=2)
-    if not isinstance(reach, int) or reach < 0:
-        raise ValueError(f"reach: expected an integer of at least 0, got {reach!r}")
-    check_scalar("ratio", ratio)
-    wide = jnp.promote_types(offset.dtype, jnp.float32)
-    chosen = jnp.asarray(offset).astype(wide)
-    if depth is not None and reach > 0:
-        check_image("depth", depth, size=(height, width), channels=1)
-        nearest = jnp.where(jnp.isnan(depth), jnp.inf, depth)
-        for axis in (1, 0):
-            nearest, chosen = _nearest_of(nearest, chosen, reach, axis)
-    chosen = jnp.where(jnp.all(jnp.isfinite(chosen), -1, keepdims=True), chosen, 0)
-    return positions(height, width, wide) - jnp.asarray(ratio).astype(wide) * chosen
+    at, offset, error = _search(flow, fraction, start, iterations=iterations, solver=solver, filter=filter)
+    return Correspondence(at, offset if flow.shape[2] == 3 else None, error)

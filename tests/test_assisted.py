@@ -52,16 +52,18 @@ def assisted_loop(previous, next, target, alpha, epsilon=0.05):
     return out, seen
 
 
-def test_against_the_loop():
+@pytest.mark.parametrize("size", [(H, W), (19, 7)], ids=str)
+def test_against_the_loop(size):
+    """19 rows are more than a strip of the CPU's loop."""
     rng = np.random.default_rng(3)
 
     def flow():
-        return (rng.uniform(-2, 2, (H, W, 3)) * [1, 1, 0.02]).astype(np.float32)
+        return (rng.uniform(-2, 2, (*size, 3)) * [1, 1, 0.02]).astype(np.float32)
 
     def depth():
-        return np.where(rng.uniform(size=(H, W, 1)) < 0.7, 4.0, 6.0).astype(np.float32)
+        return np.where(rng.uniform(size=(*size, 1)) < 0.7, 4.0, 6.0).astype(np.float32)
 
-    previous, next = keyframe(random(H, W, 2), depth()), keyframe(random(H, W, 2, seed=1), depth())
+    previous, next = keyframe(random(*size, 2), depth()), keyframe(random(*size, 2, seed=1), depth())
     target = keyframe(None, depth(), flow(), flow())
     made = jx.interpolate_assisted(previous, next, target, 0.3)
     color, seen = assisted_loop(previous, next, target, 0.3)

@@ -1,0 +1,62 @@
+"""Work in strips of rows: on a CPU what one strip needs stays in the cache, and what XLA does not fuse costs little."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+T = TypeVar("T")
+
+_ROWS = 16
+
+
+def rows_of(image: Array, top: Array | int, rows: int) -> Array:
+    """Rows `top` to `top + rows` of an image."""
+    return image if image.shape[0] == rows else jax.lax.dynamic_slice_in_dim(image, top, rows)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def by_strips(function: Callable[..., T], height: int, sources: Any) -> T:
+    """function(sources, top, rows) for all rows 0 .. height: arrays `[height, ...]`; on a CPU strip by strip.
+
+    The function makes rows top .. top + rows from any part of the sources, and must not close over traced values.
+    Differentiated, it is called once for all rows: of strips each would have a gradient of the size of the sources.
+    """
+
+    def whole(sources):
+        return function(sources, 0, height)
+
+    def split(sources):
+        part = jax.jit(partial(function, rows=_ROWS))  # traced once
+        example = jax.eval_shape(part, sources, jnp.zeros((), jnp.int32))
+        shapes, tree = jax.tree.flatten(example)
+        # of different numbers: equal arrays would be made once and copied
+        empty = tree.unflatten([jnp.full((height, *a.shape[1:]), k, a.dtype) for k, a in enumerate(shapes)])
+
+        def step(number, made):
+            top = jnp.minimum(number * _ROWS, height - _ROWS).astype(jnp.int32)  # the last one may repeat rows
+            made_now = part(sources, top)
+            return jax.tree.map(lambda a, b: jax.lax.dynamic_update_slice_in_dim(a, b, top, 0), made, made_now)
+
+        return jax.lax.fori_loop(0, -(-height // _ROWS), step, empty)
+
+    return whole(sources) if height <= _ROWS else jax.lax.platform_dependent(sources, cpu=split, default=whole)
+
+
+@by_strips.defjvp
+def _by_strips_jvp(function, height, primals, tangents):
+    return jax.jvp(lambda sources: function(sources, 0, height), primals, tangents)
+
+
+def once(value: Array) -> Array:
+    """The value `[rows, ...]`, which is not differentiated, computed once.
+
+    XLA on a CPU computes what several consumers read in each of them; what a loop reads it computes before.
+    """
+    value = jax.lax.stop_gradient(value)
+    return jax.lax.platform_dependent(
+        value, cpu=lambda v: jax.lax.scan(lambda _, row: (None, row), None, v)[1], default=lambda v: v
+    )
