@@ -157,18 +157,13 @@ def _part(sources, top, rows: int, *, filter: Filter) -> Interpolation:
     return Interpolation(blend(first, second, weight), weight, case, forward, backward, depth)
 
 
-@partial(jax.jit, static_argnames=("shader", "shade", "filter"))
-def _assisted(previous, next, target, alpha, epsilon, *, shader, shade, filter):
+@partial(jax.jit, static_argnames=("filter",))
+def _assisted(previous, next, target, alpha, epsilon, *, filter):
     wide = jnp.promote_types(target.forward_flow.dtype, jnp.float32)
     alpha, epsilon = (jnp.asarray(a).astype(wide) for a in (alpha, epsilon))
     frames = tuple((f.color, f.depth, (all_finite(f.color), all_finite(f.depth))) for f in (previous, next))
     sources = frames, (target.depth, target.backward_flow, target.forward_flow), alpha, epsilon
-    made = by_strips(partial(_part, filter=filter), target.depth.shape[0], sources)
-    color = made.color if shade is None else shade(made.color)
-    if shader is not None:
-        missed = made.case == CASES.index("missed")
-        color = jnp.where(missed[..., None], shader(missed).astype(color.dtype), color)
-    return replace(made, color=color)
+    return by_strips(partial(_part, filter=filter), target.depth.shape[0], sources)
 
 
 def interpolate_assisted(
@@ -196,7 +191,7 @@ def interpolate_assisted(
         epsilon_depth: how far depths of one point may differ, relative to the smaller.
         filter: of the colours, as in `backward_warp`.
         shader: called with the mask `[H, W]` of the pixels visible in neither frame, gives their colour `[H, W, C']`.
-        shade: called with the blended attributes, gives the colour `[H, W, C']`.
+        shade: called with the blended attributes, gives the colour `[H, W, C']`; it may close over what changes.
 
     Returns:
         An `Interpolation` without offsets.
@@ -227,7 +222,13 @@ def interpolate_assisted(
     check_choice("filter", filter, get_args(Filter))
     previous, next = (Keyframe(color=f.color, depth=f.depth) for f in (previous, next))
     target = replace(target, color=None, stencil=None, time=None)
-    return _assisted(previous, next, target, alpha, epsilon_depth, shader=shader, shade=shade, filter=filter)
+    made = _assisted(previous, next, target, alpha, epsilon_depth, filter=filter)
+    # not compiled with the rest: what they close over may change from frame to frame
+    color = made.color if shade is None else shade(made.color)
+    if shader is not None:
+        missed = made.case == CASES.index("missed")
+        color = jnp.where(missed[..., None], shader(missed).astype(color.dtype), color)
+    return replace(made, color=color)
 
 
 def drawn_over(below: Interpolation, above: Interpolation, covered: Array, epsilon: Array) -> Interpolation:

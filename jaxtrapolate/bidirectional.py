@@ -238,8 +238,8 @@ def _part(sources, top, rows: int, *, options: _Options) -> tuple[Interpolation,
     return Interpolation(color, weight, case[..., 0].astype(jnp.int32), forward, backward, depth), tuple(left)
 
 
-@partial(jax.jit, static_argnames=("options", "shade"))
-def _interpolate(previous, next, alpha, offsets, epsilon_error, epsilon_depth, epsilon_trip, *, options, shade):
+@partial(jax.jit, static_argnames=("options",))
+def _interpolate(previous, next, alpha, offsets, epsilon_error, epsilon_depth, epsilon_trip, *, options):
     flow, opposite = previous.forward_flow, next.backward_flow
     wide = jnp.promote_types(jnp.promote_types(flow.dtype, opposite.dtype), jnp.float32)
     numbers = (alpha, epsilon_error, epsilon_depth, epsilon_trip)
@@ -265,8 +265,7 @@ def _interpolate(previous, next, alpha, offsets, epsilon_error, epsilon_depth, e
         lasts = (offsets.forward, offsets.forward_depth, last), (offsets.backward, offsets.backward_depth, 1 - last)
     sources = side(previous, flow, alpha, *lasts[0]), side(next, opposite, 1 - alpha, *lasts[1]), *epsilons
     made, left = by_strips(partial(_part, options=options), flow.shape[0], sources)
-    color = made.color if shade is None else shade(made.color)
-    return replace(made, color=color, offsets=Offsets(alpha, *left))
+    return replace(made, offsets=Offsets(alpha, *left))
 
 
 def _checked(previous: Keyframe, next: Keyframe) -> Size:
@@ -354,8 +353,9 @@ def interpolate_bidirectional(
         epsilon_trip: in pixels.
         filter: of the colours, as in `backward_warp`.
         shader: for pixels of the target visible in neither frame, see `interpolate_assisted`.
-        shade: called with the blended attributes `[H, W, C]`, gives the colour `[H, W, C']`: attributes may be
-            reprojected and lit anew (section 9). In the mode "render" the target's colour is drawn after it.
+        shade: called with the blended attributes `[H, W, C]`, gives the colour `[H, W, C']`: normals, texture
+            coordinates, ... are reprojected and lit anew (section 9, vertex-bound scenes); it may close over the light
+            of this frame. In the mode "render" the target's colour is drawn after it.
 
     Returns:
         An `Interpolation`.
@@ -399,9 +399,9 @@ def interpolate_bidirectional(
     if (target is None) != (stencil_ids is None):
         raise ValueError("stencil_ids, target: expected both or neither here, got one")
     thresholds = (epsilon_error, epsilon_depth, epsilon_trip)
-    made = _interpolate(
-        *slim(previous, next), alpha, offsets, *thresholds, options=_options(previous, next, **how), shade=shade
-    )
+    made = _interpolate(*slim(previous, next), alpha, offsets, *thresholds, options=_options(previous, next, **how))
+    # not compiled with the rest: what it closes over may change from frame to frame
+    made = made if shade is None else replace(made, color=shade(made.color))
     if target is None or stencil_ids is None:
         return made
     stencil = check_present("target.stencil", target.stencil, needed_by="stencil_ids")

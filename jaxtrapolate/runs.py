@@ -33,13 +33,19 @@ def _split(options: dict[str, Any]) -> tuple[dict[str, Any], Static]:
     return thresholds, tuple(sorted(lists.items()))
 
 
-def _frames(previous, next, alphas, targets, keep: Callable, total, thresholds, options: Static):
+def _lit(options: Static, light) -> Callable | None:
+    """`shade` of a frame, by its light if there is one."""
+    shade = dict(options).get("shade")
+    return shade if shade is None or light is None else lambda attributes: shade(attributes, light)
+
+
+def _frames(previous, next, alphas, targets, lights, keep: Callable, total, thresholds, options: Static):
     """Frames at `alphas` in one scan: (total, what was kept), by keep(total, color) -> (total, kept)."""
 
     def step(carried, given):
         offsets, total = carried
-        alpha, target = given
-        how = thresholds | dict(options)
+        alpha, target, light = given
+        how = thresholds | dict(options) | {"shade": _lit(options, light)}
         made = interpolate_bidirectional(previous, next, alpha, target=target, offsets=offsets, **how)
         total, kept = keep(total, made.color)
         return (offsets if made.offsets is None else made.offsets, total), kept
@@ -50,7 +56,7 @@ def _frames(previous, next, alphas, targets, keep: Callable, total, thresholds, 
     start = Offsets(jnp.asarray(0.5, none.dtype), none, none, far, far)  # of no frame yet
     # differentiated, a step is made again, instead of keeping all that it computed
     step = jax.checkpoint(step, prevent_cse=False)
-    (_, total), kept = jax.lax.scan(step, (start, total), (alphas, targets))
+    (_, total), kept = jax.lax.scan(step, (start, total), (alphas, targets, lights))
     return total, kept
 
 
@@ -61,9 +67,9 @@ def _wide(*frames: Keyframe):
 
 
 @partial(jax.jit, static_argnames=("factor", "options"))
-def _run(previous, next, targets, thresholds, *, factor, options):
+def _run(previous, next, targets, lights, thresholds, *, factor, options):
     alphas = jnp.arange(1, factor, dtype=_wide(previous, next)) / factor
-    return _frames(previous, next, alphas, targets, lambda _, c: (None, c), None, thresholds, options)[1]
+    return _frames(previous, next, alphas, targets, lights, lambda _, c: (None, c), None, thresholds, options)[1]
 
 
 def interpolate_run(
@@ -72,6 +78,7 @@ def interpolate_run(
     *,
     factor: int,
     targets: Keyframe | None = None,
+    lights: Any = None,
     **options: Any,
 ) -> Float[Array, "n h w c"]:
     """All `factor - 1` frames between two rendered ones, in order, one scan; each starts from the offsets of the last.
@@ -80,6 +87,8 @@ def interpolate_run(
         previous, next: as of `interpolate_bidirectional`.
         factor: the frames are at alpha = k / factor, k = 1 .. factor - 1; at least 2.
         targets: as `target`, each field `[factor - 1, ...]`.
+        lights: any arrays `[factor - 1, ...]`, of which `shade` gets those of its frame: shade(attributes, light), so
+            that attributes are lit as the scene is then (section 9). Traced, unlike `shade`.
         options: of `interpolate_bidirectional`, but target and offsets.
 
     Returns:
@@ -96,12 +105,21 @@ def interpolate_run(
     thresholds, static = _split(options)
     size = check_keyframe("previous", previous)
     check_keyframe("next", next, size=size)
-    return _run(*slim(previous, next), targets, thresholds, factor=factor, options=static)
+    _check_lights(lights, factor - 1, static)
+    return _run(*slim(previous, next), targets, lights, thresholds, factor=factor, options=static)
+
+
+def _check_lights(lights: Any, number: int, options: Static) -> None:
+    if lights is not None and dict(options).get("shade") is None:
+        raise ValueError("lights: expected none without shade")
+    for leaf in jax.tree.leaves(lights):
+        if jnp.ndim(leaf) == 0 or jnp.shape(leaf)[0] != number:
+            raise ValueError(f"lights: expected arrays [{number}, ...], got {list(jnp.shape(leaf))}")
 
 
 @partial(jax.jit, static_argnames=("samples", "options"))
-def _blur(before, after, shutter, targets, thresholds, *, samples, options):
-    shade = dict(options).get("shade")
+def _blur(before, after, shutter, targets, lights, thresholds, *, samples, options):
+    shade = _lit(options, jax.tree.map(lambda a: a[samples], lights))
     sharp = after[0].color if shade is None else shade(after[0].color)
     wide, parts = jnp.promote_types(sharp.dtype, jnp.float32), 2 * samples + 1
 
@@ -111,10 +129,16 @@ def _blur(before, after, shutter, targets, thresholds, *, samples, options):
     steps = jnp.arange(1, samples + 1, dtype=_wide(*before, *after))
     steps = jnp.asarray(shutter).astype(steps.dtype) / parts * steps
     total = jnp.zeros(sharp.shape, wide)
-    # on both sides from the rendered frame on
-    earlier, later = (jax.tree.map(lambda a, s=s: a[s], targets) for s in (np.s_[samples - 1 :: -1], np.s_[samples:]))
-    for (first, second), alphas, given in ((before, 1 - steps, earlier), (after, steps, later)):
-        total, _ = _frames(first, second, alphas, given, add, total, thresholds, options)
+
+    def cut(tree, places):
+        return jax.tree.map(lambda a: a[places], tree)
+
+    earlier = np.s_[samples - 1 :: -1]  # on both sides from the rendered frame on
+    for (first, second), alphas, target, light in (
+        (before, 1 - steps, cut(targets, earlier), cut(lights, earlier)),
+        (after, steps, cut(targets, np.s_[samples:]), cut(lights, np.s_[samples + 1 :])),
+    ):
+        total, _ = _frames(first, second, alphas, target, light, add, total, thresholds, options)
     return (sharp.astype(wide) + total / parts).astype(sharp.dtype)
 
 
@@ -126,6 +150,7 @@ def motion_blur(
     shutter: float | Float[ArrayLike, ""] = 0.5,
     samples: int = 5,
     targets: Keyframe | None = None,
+    lights: Any = None,
     **options: Any,
 ) -> Float[Array, "h w c"]:
     """A rendered frame as a camera with an open shutter sees it: the mean of it and of the frames made around it.
@@ -143,6 +168,7 @@ def motion_blur(
         targets: the geometry of the frames to be made, `target` of `interpolate_bidirectional`, each field
             `[2 samples, ...]` in order of time: at k shutter / (2 samples + 1) intervals from `current`,
             k = -samples .. samples without 0.
+        lights: as of `interpolate_run`, `[2 samples + 1, ...]` in order of time, with the rendered frame's.
         options: of `interpolate_bidirectional`, but target and offsets. `shade` is called for each frame, the rendered
             one too, and what it gives is averaged.
 
@@ -177,6 +203,6 @@ def motion_blur(
     size = check_keyframe("current", current)
     check_keyframe("previous", previous, size=size)
     check_keyframe("next", next, size=size)
-    return _blur(
-        slim(previous, current), slim(current, next), shutter, targets, thresholds, samples=samples, options=static
-    )
+    _check_lights(lights, 2 * samples + 1, static)
+    sides = slim(previous, current), slim(current, next)
+    return _blur(*sides, shutter, targets, lights, thresholds, samples=samples, options=static)

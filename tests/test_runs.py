@@ -53,6 +53,54 @@ def test_a_run_is_compiled_once():
     assert count() == 0
 
 
+# Attributes that are lit in each frame (section 9: vertex-bound scenes)
+
+
+def brightness(time):
+    """Of a lamp that flashes between the rendered frames, at 0, 1, ..., where it is 1."""
+    return 1 - 0.7 * np.sin(np.pi * time) ** 2
+
+
+def shade(attributes, light):
+    """Albedo by a lamp from the front; attributes: albedo, normal."""
+    return attributes[..., :3] * jnp.maximum(attributes[..., 5:6], 0) * light
+
+
+def attributes_of(time, size):
+    frame = synthetic.make_frame(time, size)
+    return np.concatenate([frame.gbuffer.albedo, frame.gbuffer.normal], -1)
+
+
+def with_attributes(size, steps=4):
+    return tuple(jx.replace(frame, color=jnp.asarray(attributes_of(k * steps, size)))
+                 for k, frame in enumerate(moving(steps, size)))  # fmt: skip
+
+
+def test_light_that_changes_between_rendered_frames():
+    """Attributes are lit by each frame's own light; colours can only be blended, here of two bright frames."""
+    size, steps, times = (48, 61), 4, np.float32([0.25, 0.5, 0.75])
+    previous, next, _ = with_attributes(size, steps)
+    lights = np.float32(brightness(times))
+    lit = jx.interpolate_run(previous, next, factor=4, shade=shade, lights=jnp.asarray(lights))
+    colors = [jx.replace(f, color=shade(f.color, jnp.float32(1))) for f in (previous, next)]
+    blended = jx.interpolate_run(*colors, factor=4)
+    for k, time in enumerate(times):
+        truth = np.asarray(shade(jnp.asarray(attributes_of(steps * time, size)), lights[k]))
+        assert db(lit[k], truth) > max(39, db(blended[k], truth) + 24)  # 40.6, 49.7, 42.3 against 14.7, 8.6, 14.7
+
+
+def test_other_lights_compile_nothing():
+    import jax._src.test_util as jtu
+
+    previous, next, _ = with_attributes((48, 61))
+    lights, others = jnp.float32([1, 2, 3]), jnp.float32([2, 4, 6])
+    first = jx.interpolate_run(previous, next, factor=4, shade=shade, lights=lights)
+    with jtu.count_jit_and_pmap_lowerings() as count:
+        second = jx.interpolate_run(previous, next, factor=4, shade=shade, lights=others)
+    assert count() == 0
+    np.testing.assert_allclose(second, 2 * first, rtol=1e-6)
+
+
 # Motion blur
 
 
@@ -72,16 +120,16 @@ def test_whole_pixels_and_attributes():
 
     Colours are averaged, not the attributes that each frame's colour is made of.
     """
-    frames = three(size=(11, 29), flow=(8, -4, 1), channels=3)
+    frames, lights = three(size=(11, 29), flow=(8, -4, 1), channels=3), np.float32([0.5, 1, 3])
 
-    def shade(attributes):
-        return attributes[..., :2] * attributes[..., 2:]
+    def shade(attributes, light):
+        return attributes[..., :2] * attributes[..., 2:] * light
 
-    blurred = np.asarray(jx.motion_blur(*frames, shutter=0.75, samples=1, shade=shade))
+    blurred = np.asarray(jx.motion_blur(*frames, shutter=0.75, samples=1, shade=shade, lights=jnp.asarray(lights)))
     colors = [np.float64(frame.color) for frame in frames]
     before = 0.25 * oracles.shift(colors[0], -6, 3, np.nan) + 0.75 * oracles.shift(colors[1], 2, -1, np.nan)
     after = 0.75 * oracles.shift(colors[1], -2, 1, np.nan) + 0.25 * oracles.shift(colors[2], 6, -3, np.nan)
-    expected = (shade(before) + shade(colors[1]) + shade(after)) / 3
+    expected = sum(map(shade, (before, colors[1], after), lights)) / 3
     inside = ~np.isnan(expected)
     assert inside.mean() > 0.2
     np.testing.assert_allclose(blurred[inside], expected[inside], atol=1e-6)
@@ -219,6 +267,8 @@ def test_against_an_embedded_scene(name, shutter, least):
         ({"next": None}, TypeError, "next: expected a Keyframe, got NoneType"),
         ({"previous": jx.Keyframe(color=jnp.ones((2, 3, 1)))}, ValueError, r"previous.color: expected shape \[6, 13,"),
         ({"choice": "best"}, ValueError, "choice: expected one of"),
+        ({"lights": jnp.ones(11)}, ValueError, "lights: expected none without shade"),
+        ({"lights": jnp.ones(10), "shade": shade}, ValueError, r"lights: expected arrays \[11, ...\], got \[10\]"),
     ],
 )
 def test_errors(unchecked, options, error, message):
