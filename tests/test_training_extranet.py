@@ -92,6 +92,7 @@ def test_the_loss_is_that_of_the_paper(space):
     np.testing.assert_allclose(total, sum(expected.values()), rtol=2e-4)
 
 
+@pytest.mark.slow
 def test_the_sky_has_no_gradient():
     task, made = example()
     made = made | {"target": made["target"].at[:16].set(jnp.nan)}
