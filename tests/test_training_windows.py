@@ -12,7 +12,7 @@ from flax import nnx
 from synthetic import make_frame, make_keyframe
 
 import jaxtrapolate as jx
-from jaxtrapolate.evaluation import Window, arguments
+from jaxtrapolate.evaluation import Window, arguments, hide
 from jaxtrapolate.evaluation import windows as windows_of
 from jaxtrapolate.files import InputError, open_sequence, write_unreal_frame
 from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence, flow, scene
@@ -362,3 +362,24 @@ def test_a_network_trained_on_rendered_windows(tmp_path):
     assert losses[-1] < losses[0]
     assert scores["gain"] > 1.3
     assert len(list((tmp_path / "images").iterdir())) == 2
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_bare_windows_have_depth_and_stencil_alone(monkeypatch, share):
+    names = ("albedo", "depth", "normal", "stencil")
+    frame = jx.Frame(color=jnp.ones((4, 5, 3)), motion=jnp.zeros((4, 5, 2)),
+                     gbuffer=jx.GBuffer(**{name: jnp.ones((4, 5, 3)) for name in names}))  # fmt: skip
+    window = Window(
+        number=0, truth=frame, history=(frame, jx.Frame(motion=frame.motion)), target=hide(frame), future=()
+    )
+    monkeypatch.setattr(Windows, "_draw", lambda *_: ("walkers", jax.tree.map(lambda a: jnp.asarray(a)[None], window)))
+
+    def prepare(window, key):
+        there = {str([name for name in names if getattr(f.gbuffer, name) is not None])
+                 for f in (window.truth, window.history[0], window.target)}  # fmt: skip
+        assert len(there) == 1
+        assert window.history[1].motion is not None
+        return jnp.float32("albedo" not in there.pop())
+
+    made = Windows(WindowOptions(size=(4, 5), bare=share), prepare, past=1).pool(jax.random.key(0), range(100))
+    assert abs(np.asarray(made).mean() - share) <= (0.15 if 0 < share < 1 else 0)

@@ -3,7 +3,16 @@
 from collections.abc import Callable
 from os import PathLike
 
-from jaxtrapolate.methods import bidirectional, blending, extranet, grids, opticalflow, reprojection, warping
+from jaxtrapolate.methods import (
+    bidirectional,
+    blending,
+    extranet,
+    grids,
+    interpolator,
+    opticalflow,
+    reprojection,
+    warping,
+)
 from jaxtrapolate.methods.method import Method as Method
 from jaxtrapolate.methods.method import Stage as Stage
 from jaxtrapolate.weights import default_weights
@@ -27,7 +36,10 @@ _METHODS: dict[str, Callable[[], Method]] = {
 }
 
 
-_NETWORKS: dict[str, Callable[[str | PathLike[str]], Method]] = {"extranet": extranet.load}
+_NETWORKS: dict[str, Callable[[str | PathLike[str]], Method]] = {
+    "extranet": extranet.load,
+    "interpolator": interpolator.load,
+}
 """Methods with weights, each made from a file of them."""
 
 

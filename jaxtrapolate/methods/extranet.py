@@ -5,6 +5,7 @@ Histories are warped demodulated, holes are marked, and the network answers in t
 """
 
 import dataclasses
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -31,9 +32,10 @@ from jaxtrapolate.methods.stages import (
 from jaxtrapolate.methods.warping import GUIDED
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig, extranet_from_torch
 from jaxtrapolate.networks.inference import inference
+from jaxtrapolate.networks.stored import load_network
 from jaxtrapolate.radiance import By, demodulate, log_decode, log_encode
 from jaxtrapolate.records import GBuffer
-from jaxtrapolate.weights import configured, fit, load_orbax, load_weights, read_torch, save_weights
+from jaxtrapolate.weights import configured, read_torch, save_weights
 
 _NAME = "extranet"
 
@@ -257,15 +259,13 @@ def load_extranet(path: str | PathLike[str]) -> tuple[ExtraNet, Preparation]:
             return extranet_from_torch(checkpoint.get("state_dict", checkpoint)), RELEASE
         except ValueError as error:
             raise ValueError(f"{path}: no weights of ExtraNet: {error}") from error
-    weights = load_orbax(path) if path.is_dir() else load_weights(path)
-    if weights.method not in (_NAME, None):
-        raise ValueError(f"{path}: weights of method {weights.method!r}, expected {_NAME!r}")
-    config = configured(ExtraNetConfig, weights.config.get("network", {}), source=str(path))
-    preparation = configured(Preparation, weights.config.get("preparation", {}), source=str(path))
-    structure, state = nnx.split(nnx.eval_shape(lambda: ExtraNet(config, rngs=nnx.Rngs(0))))
-    fitted = fit(nnx.to_pure_dict(state), weights.tree, source=str(path))
-    nnx.replace_by_pure_dict(state, fitted)
-    return nnx.merge(structure, state), preparation
+
+    def build(stated: Mapping[str, Any]):
+        config = configured(ExtraNetConfig, stated.get("network", {}), source=str(path))
+        return lambda: ExtraNet(config, rngs=nnx.Rngs(0))
+
+    model, stated = load_network(path, _NAME, build)
+    return model, configured(Preparation, stated.get("preparation", {}), source=str(path))
 
 
 def extranet_config(config: ExtraNetConfig, preparation: Preparation) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from jaxtrapolate.training.config import config_names as config_names
 from jaxtrapolate.training.config import load_config as load_config
 from jaxtrapolate.training.config import parse_config as parse_config
 from jaxtrapolate.training.extranet import ExtraNetOptions, ExtraNetTask
+from jaxtrapolate.training.interpolator import InterpolatorOptions, InterpolatorTask
 from jaxtrapolate.training.loop import TrainingError as TrainingError
 from jaxtrapolate.training.loop import train_and_evaluate as train_and_evaluate
 from jaxtrapolate.training.tasks import TASKS as TASKS
@@ -14,3 +15,4 @@ from jaxtrapolate.training.tasks import Entry as Entry
 from jaxtrapolate.training.tasks import Task as Task
 
 TASKS["extranet"] = Entry(ExtraNetOptions, ExtraNetTask)
+TASKS["interpolator"] = Entry(InterpolatorOptions, InterpolatorTask)

@@ -17,13 +17,15 @@ from jaxtrapolate.methods.extranet import Preparation, encoded_truth, extranet, 
 from jaxtrapolate.methods.stages import demodulated
 from jaxtrapolate.metrics import psnr
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
-from jaxtrapolate.radiance import compress, demodulation_divisor, log_decode, tonemap
+from jaxtrapolate.radiance import demodulation_divisor, log_decode, tonemap
 from jaxtrapolate.training.augment import crop
 from jaxtrapolate.training.config import check_range
 from jaxtrapolate.training.tasks import Batch, Example
 from jaxtrapolate.training.windows import WindowOptions, Windows
 
 _SHOWN = 4  # windows that validation shows
+_BRIGHTEST = 16.0  # in the log domain; above it nothing is told apart
+_DARKEST = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,8 +37,8 @@ class ExtraNetOptions:
         preparation: what it is shown; goes into the file of its weights.
         windows: the examples.
         crop: `(H, W)` of an item, a multiple of the network's.
-        space: where errors are measured: "log" of the light, as in the paper; or "display", `compress` of the image,
-            where an error under a dark albedo counts as little as it is seen.
+        space: where errors are measured: "log" of the light, as in the paper; or "display", the image after a tone
+            curve, where an error under a dark albedo counts as little as it is seen.
         hole_weight, shade_weight, shade, shade_fraction: of `extranet_loss`.
         validation: windows that validation looks at.
     """
@@ -144,9 +146,16 @@ def _answer(model: Any, batch: Batch) -> Array:
 
 
 def _display(light: Array, divisor: Array) -> Array:
-    """Light in the log domain as an image after `compress`; NaN stays."""
+    """Light in the log domain as an image after a tone curve; NaN stays.
+
+    The curve is sqrt(x / (1 + x)) begun at 0.001, where its slope is 16, and goes on straight below 0, so that what is
+    too dark can learn.
+    """
     known = jnp.isfinite(light)
-    return jnp.where(known, compress(log_decode(jnp.where(known, light, 0)) * divisor), jnp.nan)
+    image = jnp.expm1(jnp.minimum(jnp.where(known, light, 0), _BRIGHTEST)) * divisor
+    lit = image > 0
+    mapped = jnp.sqrt(1 - 1 / (1 + _DARKEST + jnp.where(lit, image, 0)))
+    return jnp.where(known, jnp.where(lit, mapped, mapped + image * (0.5 / _DARKEST**0.5)), jnp.nan)
 
 
 @nnx.jit

@@ -20,7 +20,7 @@ from jaxtrapolate.checks import Size, check_choice
 from jaxtrapolate.evaluation import Window, hide
 from jaxtrapolate.evaluation import windows as windows_of
 from jaxtrapolate.files import InputError, Sequence, open_sequence, runs
-from jaxtrapolate.records import Frame, replace
+from jaxtrapolate.records import Frame, GBuffer, replace
 from jaxtrapolate.scenes import TRAINING_SEEDS, Scene, render, scene, scene_names, stack_scenes
 from jaxtrapolate.training.augment import flip
 from jaxtrapolate.training.config import check_range
@@ -54,6 +54,7 @@ class WindowOptions:
         motion: "chained" = as in evaluation, motion leads from frame to frame, through frames with buffers alone;
             "direct" = exact motion from one rendered frame to the next, without the frames between.
         flip: how likely a window is mirrored left to right, and top to bottom.
+        bare: the share of windows that are shown with colour, motion, depth and stencil alone, as many engines write.
         together: how many windows in a row are of one scene; accelerators render these at once.
         dumps: folders of frames with all buffers, see `jaxtrapolate.files.open_sequence`.
         dumps_share: of the windows that are of dumps, where there are any; each window of all dumps is equally likely.
@@ -66,6 +67,7 @@ class WindowOptions:
     time: tuple[float, float] = (0.0, 120.0)
     motion: MotionPath = "chained"
     flip: tuple[float, float] = (0.5, 0.0)
+    bare: float = 0.0
     together: int = 1
     dumps: tuple[str, ...] = ()
     dumps_share: float = 0.5
@@ -84,6 +86,7 @@ class WindowOptions:
         if not all(0 <= p <= 1 for p in self.flip):
             raise ValueError(f"flip: expected two probabilities, got {list(self.flip)}")
         check_range(self, "together", least=1)
+        check_range(self, "bare", least=0, most=1)
         check_range(self, "dumps_share", least=0, most=1)
         if not (self.dumps if self.dumps_share == 1 else self.scenes):
             raise ValueError(f"{'dumps' if self.dumps_share == 1 else 'scenes'}: expected some, got none")
@@ -140,6 +143,17 @@ def scene_window(
         target=hide(frames[0]),
         future=tuple(frames[k] for k in sorted(frames) if k > 0),
     )
+
+
+def _bare(window: Window) -> Window:
+    """The window without the buffers of its frames but depth and stencil."""
+
+    def strip(node: Any) -> Any:
+        if not isinstance(node, Frame) or node.gbuffer is None:
+            return node
+        return replace(node, gbuffer=GBuffer(depth=node.gbuffer.depth, stencil=node.gbuffer.stencil))
+
+    return jax.tree.map(strip, window, is_leaf=lambda node: isinstance(node, Frame))
 
 
 def _buffers(world: Scene, time: Array, *, size: Size, previous_time: Array) -> Frame:
@@ -223,6 +237,8 @@ class Windows:
             name, windows = self._read(rng, count)
         else:
             name, windows = self._draw(rng, count, VALIDATION_SEEDS if validation else SEEDS)
+        if options.bare and rng.random() < options.bare:
+            windows = _bare(windows)
         try:
             return self._prepare(windows, *flips, keys)
         except ValueError as error:

@@ -1,0 +1,54 @@
+"""A learned interpolator as a method: the rendered frames around the target and nothing else, as of a video."""
+
+import dataclasses
+from collections.abc import Mapping
+from os import PathLike
+from typing import Any
+
+from flax import nnx
+
+from jaxtrapolate.methods.between import PAIR
+from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.networks.inference import inference
+from jaxtrapolate.networks.interpolator import Interpolator, InterpolatorConfig
+from jaxtrapolate.networks.stored import load_network
+from jaxtrapolate.radiance import compress, expand
+from jaxtrapolate.weights import configured
+
+_NAME = "interpolator"
+
+
+def interpolator(model: Interpolator) -> Method:
+    """The method with a network's weights: the baseline "learned video interpolation".
+
+    The network sees the frames before and after through `compress`, as values of a display, and the target's time
+    between them: `values["inputs"]` is `(first, second, time)`. Pixels that are not finite count as black or white.
+
+    References: of the kind of Kong et al. 2022 (IFRNet), see `jaxtrapolate.networks.interpolator` for what differs.
+    """
+    function, state = inference(model)
+
+    def inputs(state, values: Values):
+        first, second = (compress(values[name].color) for name in ("previous", "next"))
+        return {"inputs": (first, second, values["alpha"].astype(first.dtype))}
+
+    def network(state, values: Values):
+        return {"image": expand(function(state, *values["inputs"]))}
+
+    stages = (PAIR, Stage("inputs", inputs), Stage("network", network))
+    return Method(_NAME, stages, kind="interpolation", future=1, state=state, networks={"network": function})
+
+
+def interpolator_config(config: InterpolatorConfig) -> dict[str, Any]:
+    """What a file of weights states about them, as `load` reads it."""
+    return {"network": dataclasses.asdict(config)}
+
+
+def load(path: str | PathLike[str]) -> Method:
+    """The method with the weights in a file; see `load_network`."""
+
+    def build(stated: Mapping[str, Any]):
+        config = configured(InterpolatorConfig, stated.get("network", {}), source=str(path))
+        return lambda: Interpolator(config, rngs=nnx.Rngs(0))
+
+    return interpolator(load_network(path, _NAME, build)[0])

@@ -1,0 +1,34 @@
+"""Networks from files of weights."""
+
+from collections.abc import Callable, Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeVar
+
+from flax import nnx
+
+from jaxtrapolate.weights import fit, load_orbax, load_weights
+
+M = TypeVar("M", bound=nnx.Module)
+
+
+def load_network(
+    path: str | PathLike[str], method: str, build: Callable[[Mapping[str, Any]], Callable[[], M]]
+) -> tuple[M, Mapping[str, Any]]:
+    """A method's network with the weights in a file, and what the file states that the method is built with.
+
+    Args:
+        path: what ends in `.npz` is read by `load_weights`, a folder by `load_orbax`.
+        method: whose weights these have to be.
+        build: gives, for what the file states, the function that makes the network. It is never run, only traced.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: one line that names the file: damaged, of another method, or with weights that do not fit.
+    """
+    weights = load_orbax(path) if Path(path).is_dir() else load_weights(path)
+    if weights.method not in (method, None):
+        raise ValueError(f"{path}: weights of method {weights.method!r}, expected {method!r}")
+    structure, state = nnx.split(nnx.eval_shape(build(weights.config)))
+    nnx.replace_by_pure_dict(state, fit(nnx.to_pure_dict(state), weights.tree, source=str(path)))
+    return nnx.merge(structure, state), weights.config

@@ -1,0 +1,129 @@
+"""Training of the learned interpolator: the two rendered frames around a target, and the target, as display values."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, PRNGKeyArray
+
+from jaxtrapolate.checks import Size, check_present
+from jaxtrapolate.evaluation import Window
+from jaxtrapolate.losses import charbonnier_loss
+from jaxtrapolate.methods.interpolator import interpolator, interpolator_config
+from jaxtrapolate.metrics import psnr
+from jaxtrapolate.networks.interpolator import Interpolator, InterpolatorConfig
+from jaxtrapolate.radiance import compress, expand, tonemap
+from jaxtrapolate.training.augment import crop
+from jaxtrapolate.training.config import check_range
+from jaxtrapolate.training.tasks import Batch, Example
+from jaxtrapolate.training.windows import WindowOptions, Windows
+
+_SHOWN = 4  # windows that validation shows
+
+
+@dataclasses.dataclass(frozen=True)
+class InterpolatorOptions:
+    """What is learned, from what.
+
+    Attributes:
+        network: its size.
+        windows: the examples; no motion is looked at, so "direct" saves its rendering.
+        crop: `(H, W)` of an item.
+        epsilon: of `charbonnier_loss`.
+        validation: windows that validation looks at.
+    """
+
+    network: InterpolatorConfig = dataclasses.field(default_factory=InterpolatorConfig)
+    windows: WindowOptions = dataclasses.field(default_factory=lambda: WindowOptions(motion="direct"))
+    crop: Size = (128, 128)
+    epsilon: float = 1e-3
+    validation: int = 36
+
+    def __post_init__(self) -> None:
+        check_range(self, "epsilon", above=0)
+        check_range(self, "validation", least=1)
+        if any(a > b for a, b in zip(self.crop, self.windows.size, strict=True)):
+            raise ValueError(f"crop: expected at most windows.size = {list(self.windows.size)}, got {list(self.crop)}")
+
+
+class InterpolatorTask:
+    """Trains an `Interpolator` on what the method "interpolator" shows it, at the middle between two rendered frames.
+
+    An example holds "first" and "second", the network's inputs, and "target", the true frame as `compress` shows it.
+
+    References: Kong et al. 2022 (IFRNet), its reconstruction loss. Departures: without its census, flow distillation
+    and feature losses; the flow is learned from colour alone.
+    """
+
+    score = "psnr"
+
+    def __init__(self, options: InterpolatorOptions = InterpolatorOptions()) -> None:
+        self.options = options
+        self._stages = interpolator(Interpolator(options.network, rngs=nnx.Rngs(0)))
+        self._windows = Windows(options.windows, self._prepare, past=1, future=1)
+        self._held: Example | None = None
+        scenes = ", ".join(options.windows.scenes)
+        config = interpolator_config(options.network)
+        self.about: Mapping[str, Any] = {"method": "interpolator", "config": config, "note": f"trained on {scenes}"}
+
+    def _prepare(self, window: Window, key: PRNGKeyArray) -> Example:
+        del key
+        method = self._stages
+        values = method.values_before("network", method.state, (), window.history, window.target, window.future)
+        first, second, _ = values["inputs"]
+        truth = compress(check_present("color", window.truth.color, needed_by="training"))
+        return {"first": first, "second": second, "target": truth}
+
+    def init(self, rngs: nnx.Rngs) -> nnx.Module:
+        """A new network."""
+        return Interpolator(self.options.network, rngs=rngs)
+
+    def pool(self, key: PRNGKeyArray, numbers: range) -> Example:
+        """Prepared windows of the scenes' training seeds."""
+        return self._windows.pool(key, numbers)
+
+    def sample(self, example: Example, key: PRNGKeyArray) -> Batch:
+        """A random crop, as likely backward in time as forward."""
+        place, order = jax.random.split(key)
+        item = crop(example, place, size=self.options.crop)
+        backward = jax.random.bernoulli(order)
+        first, second = item["first"], item["second"]
+        turned = {"first": jnp.where(backward, second, first), "second": jnp.where(backward, first, second)}
+        return item | turned
+
+    def loss(self, model: nnx.Module, batch: Batch) -> tuple[Array, Mapping[str, Array]]:
+        """`charbonnier_loss`, its mean over the batch."""
+        made = _answer(model, batch)
+        return jnp.mean(
+            jax.vmap(lambda *a: charbonnier_loss(*a, epsilon=self.options.epsilon))(made, batch["target"])
+        ), {}
+
+    def validate(self, model: nnx.Module) -> tuple[Mapping[str, float], Mapping[str, Any]]:
+        """dB of whole validation windows, tone mapped: "psnr"; "blend", of the mean of the two frames."""
+        if self._held is None:
+            self._held = self._windows.pool(jax.random.key(0), range(self.options.validation), validation=True)
+        rows, images = [], {}
+        for i in range(self.options.validation):
+            row, shown = _scored(model, jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], self._held))
+            rows.append({name: float(value) for name, value in row.items()})
+            if i < _SHOWN:
+                images[f"window{i}"] = np.asarray(shown)
+        return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}, images
+
+
+def _answer(model: Any, batch: Batch) -> Array:
+    first = batch["first"]
+    return model(first, batch["second"], jnp.full(first.shape[0], 0.5, first.dtype))
+
+
+@nnx.jit
+def _scored(model: Any, one: Batch) -> tuple[dict[str, Array], Array]:
+    """The scores of one window, and the true image, the answer and the difference side by side."""
+    blend = (one["first"] + one["second"]) / 2
+    true, made, mean = (tonemap(expand(image[0])) for image in (one["target"], _answer(model, one), blend))
+    scores = {"psnr": psnr(made, true), "blend": psnr(mean, true)}
+    return scores, jnp.concatenate([true, made, jnp.minimum(4 * jnp.abs(made - true), 1)], 1)
