@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from oracles import assert_gradients, random
 
-from jaxtrapolate.losses import charbonnier_loss, extranet_loss, hole_loss, l1_loss, shading_loss
+from jaxtrapolate.losses import charbonnier_loss, extranet_loss, hole_loss, l1_loss, relative_loss, shading_loss
 
 
 def images(height, width, seed=0):
@@ -217,3 +217,22 @@ def test_errors(unchecked):
         hole_loss(image, image, image)
     with pytest.raises(TypeError, match="prediction: expected a floating-point array"):
         charbonnier_loss(image.astype(int), image)
+
+
+def test_relative_loss():
+    """What is left of the guess's squared error, where the target is finite; no gradient to the guess."""
+    generator = np.random.default_rng(3)
+    prediction, target, guess = generator.normal(size=(3, 7, 5, 3)).astype(np.float32)
+    target[2, 3] = np.nan
+    known = np.isfinite(target)
+    left, before = (np.mean((np.float64(a) - target)[known] ** 2) for a in (prediction, guess))
+    given = tuple(map(jnp.asarray, (prediction, target, guess)))
+    np.testing.assert_allclose(relative_loss(*given, epsilon=0.1), left / (before + 0.1), rtol=1e-5)
+    np.testing.assert_allclose(relative_loss(given[2], given[1], given[2], epsilon=0.0), 1, rtol=1e-6)
+    ours, theirs = jax.grad(relative_loss, argnums=(0, 2))(*given)
+    assert np.isfinite(ours).all()
+    assert not np.any(np.asarray(ours)[2, 3])
+    assert not np.any(theirs)
+    exact = jnp.nan_to_num(given[1])
+    assert float(relative_loss(exact, given[1], exact)) == 0
+    assert float(relative_loss(exact, jnp.full_like(exact, jnp.nan), exact)) == 0

@@ -298,6 +298,51 @@ def test_any_size_against_a_network_in_float64(size):
     np.testing.assert_allclose(found[0], expected, atol=2e-5)
 
 
+def test_direct_is_a_network_with_the_histories_among_its_features():
+    """The same weights, the histories appended to the target's buffers, oldest first."""
+    direct = ExtraNet(ExtraNetConfig(widths=(3, 4), features=2, histories=2, direct=True), rngs=nnx.Rngs(0))
+    plain = ExtraNet(ExtraNetConfig(widths=(3, 4), features=10, histories=2), rngs=nnx.Rngs(1))
+    nnx.update(plain, nnx.state(direct))
+    x, mask, features, history = (jnp.asarray(random(1, *s, seed=k)) for k, s in enumerate(shapes_of(9, 14)))
+    more = jnp.concatenate([features, history[:, 0], history[:, 1]], -1)
+    np.testing.assert_allclose(direct(x, mask, features, history), plain(x, mask, more, history), atol=1e-5)
+
+
+@pytest.mark.parametrize("direct", [False, True])
+def test_contrast_is_a_network_that_is_shown_differences(direct):
+    """The same weights; images but the first replaced by 3 (image - first), masks as they are."""
+    size = {"widths": (3, 4), "features": 2, "histories": 2, "direct": direct}
+    with_contrast = ExtraNet(ExtraNetConfig(**size, contrast=3.0), rngs=nnx.Rngs(0))
+    plain = ExtraNet(ExtraNetConfig(**size), rngs=nnx.Rngs(1))
+    nnx.update(plain, nnx.state(with_contrast))
+    x, mask, features, history = (jnp.asarray(random(1, *s, seed=k)) for k, s in enumerate(shapes_of(9, 14)))
+    first = x[..., :3]
+    other_x = jnp.concatenate([first, 3 * (x[..., 3:] - first)], -1)
+    other = jnp.concatenate([3 * (history[..., :3] - first[:, None]), history[..., 3:]], -1)
+    answers = with_contrast(x, mask, features, history), plain(other_x, mask, features, other)
+    np.testing.assert_allclose(*answers, atol=1e-5)
+
+
+def shapes_of(height, width):
+    return (height, width, 6), (height, width, 1), (height, width, 2), (2, height, width, 4)
+
+
+def test_without_batch_norm_signals_keep_their_size():
+    """And the first answer is about the first guess."""
+    model = ExtraNet(ExtraNetConfig(norm=False), rngs=nnx.Rngs(0))
+    assert not any(isinstance(module, nnx.BatchNorm) for _, module in nnx.iter_modules(model))
+    x, mask, features, history = (
+        jnp.asarray(np.random.default_rng(k).normal(size=(1, *s)).astype(np.float32))
+        for k, s in enumerate(((48, 64, 6), (48, 64, 1), (48, 64, 6), (3, 48, 64, 4)))
+    )
+    value = jnp.concatenate([x, x * mask, features], -1)
+    for level in model.encoder:
+        value = level(value)
+        assert 0.3 < float(jnp.sqrt(jnp.mean(value**2))) < 3
+    residual = model(x, mask, features, history) - x[..., :3]
+    assert 0.005 < float(jnp.std(residual)) < 0.3
+
+
 def test_batches_and_mapping():
     """One frame = that frame in a batch = mapped; here of one pixel each."""
     model = extranet_from_torch(small_weights(), config=SMALL)

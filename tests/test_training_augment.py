@@ -185,3 +185,22 @@ def test_crops_that_cannot_be():
         crop([jnp.zeros((5, 3, 1)), jnp.zeros((5, 4, 1))], jax.random.key(0), size=(2, 2))
     with pytest.raises(ValueError, match="images of one size"):
         crop(jnp.zeros(5), jax.random.key(0), size=(2, 2))
+
+
+def test_a_weighted_crop_holds_what_has_weight():
+    """All weight on one pixel: it is in every crop, at the border too, and everywhere in it."""
+    image = jnp.stack(jnp.meshgrid(jnp.arange(11.0), jnp.arange(9.0)), -1)
+    keys = jax.random.split(jax.random.key(0), 300)
+    for x, y in ((5, 4), (0, 8), (10, 0)):
+        weight = jnp.zeros((9, 11, 1)).at[y, x].set(1.0)
+        cut = np.asarray(jax.vmap(lambda key, w=weight: crop(image, key, size=(3, 4), weight=w))(keys))
+        found = (cut == [x, y]).all(-1)
+        assert found.any((1, 2)).all()
+        if (x, y) == (5, 4):
+            assert found.mean(0).min() > 0.04
+    shares = np.zeros((9, 11, 1), np.float32)
+    shares[4, 2], shares[4, 8], shares[0, 0] = 3, 1, np.nan
+    cut = np.asarray(jax.vmap(lambda key: crop(image, key, size=(3, 3), weight=jnp.asarray(shares)))(keys))
+    left = (cut == [2, 4]).all(-1).any((1, 2))
+    assert (left | (cut == [8, 4]).all(-1).any((1, 2))).all()
+    assert 0.65 < left.mean() < 0.85

@@ -62,9 +62,15 @@ def test_an_example_is_what_the_method_shows_its_network():
         np.testing.assert_allclose(found, value, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
+def curve(light):
+    """sqrt(x / (1 + x)) begun at 0.001, straight below 0."""
+    lit = np.maximum(light, 0) + 1e-3
+    return np.sqrt(lit / (1 + lit)) + np.minimum(light, 0) * 0.5 / np.sqrt(1e-3)
+
+
 @pytest.mark.parametrize("space", ["log", "display"])
 def test_the_loss_is_that_of_the_paper(space):
-    """In float64: l1 + hole + the largest tenth, of what is no sky; display: after sqrt(x / (1 + x)) of the image."""
+    """In float64: l1 + hole + the largest tenth, of what is no sky; display: after a tone curve of the image."""
     task, made = example(space=space)
     batch = jax.tree.map(lambda leaf: leaf[None], made)
     model = task.init(nnx.Rngs(0))
@@ -76,8 +82,7 @@ def test_the_loss_is_that_of_the_paper(space):
     truth, divisor, mask = (np.float64(made[name]) for name in ("target", "divisor", "mask"))
     known = np.isfinite(truth)
     if space == "display":
-        answer, truth = (np.maximum(np.expm1(light), 0) * divisor for light in (answer, truth))
-        answer, truth = (np.sqrt(light / (1 + light)) for light in (answer, truth))
+        answer, truth = (curve(np.expm1(light) * divisor) for light in (answer, truth))
     error = np.where(known, np.abs(answer - truth), 0)
     hole = np.broadcast_to(1 - mask, error.shape) * known
     count = known[..., 0].sum()
@@ -90,6 +95,37 @@ def test_the_loss_is_that_of_the_paper(space):
     for name, value in expected.items():
         np.testing.assert_allclose(parts[name], value, rtol=2e-4, err_msg=name)
     np.testing.assert_allclose(total, sum(expected.values()), rtol=2e-4)
+
+
+@pytest.mark.parametrize("space", ["log", "display"])
+def test_the_relative_loss_is_what_is_left_of_the_first_guess(space):
+    task, made = example(space=space, loss="relative")
+    batch = jax.tree.map(lambda leaf: leaf[None], made)
+    model = task.init(nnx.Rngs(0))
+    model.eval()
+    history = jnp.moveaxis(made["history"], 2, 0)[None]
+    answer = np.float64(model(made["x"][None], made["mask"][None], made["features"][None], history)[0])
+    images = [answer, *(np.float64(a) for a in (made["x"][..., :3], made["target"]))]
+    if space == "display":
+        images = [curve(np.expm1(light) * np.float64(made["divisor"])) for light in images]
+    left, before = (np.nanmean((image - images[2]) ** 2) for image in images[:2])
+    np.testing.assert_allclose(task.loss(model, batch)[0], left / (before + 1e-6), rtol=1e-3)
+
+
+def test_crops_by_error():
+    """As likely around a pixel as its squared error is large; the weight is no part of the batch."""
+    task, made = example(crops="error", space="display", crop=(4, 4))
+    light = (np.float64(made[name]) for name in ("x", "target"))
+    guess, truth = (curve(np.expm1(a[..., :3]) * np.float64(made["divisor"])) for a in light)
+    error = np.nan_to_num(((guess - truth) ** 2).mean(-1))
+    np.testing.assert_allclose(made["weight"][..., 0], error, rtol=1e-2, atol=1e-7)
+    keys = jax.random.split(jax.random.key(0), 400)
+    assert "weight" not in task.sample(made, keys[0])
+    marked = {"place": jnp.stack(jnp.meshgrid(jnp.arange(48.0), jnp.arange(32.0)), -1), "weight": made["weight"]}
+    corners = np.asarray(jax.vmap(lambda key: task.sample(marked, key)["place"][0, 0])(keys))
+    held = np.array([error[int(y) : int(y) + 4, int(x) : int(x) + 4].sum() for x, y in corners])
+    anywhere = np.mean([error[r : r + 4, c : c + 4].sum() for r in range(29) for c in range(45)])
+    assert held.mean() > 1.2 * anywhere
 
 
 @pytest.mark.slow
@@ -121,7 +157,7 @@ def test_a_scene_without_albedo_or_sky():
 
 
 def test_shipped_configurations():
-    for name in ("extranet", "extranet_cpu"):
+    for name in ("extranet", "extranet_cpu", "extranet_paper"):
         config = load_config(name)
         assert isinstance(config.options, ExtraNetOptions)
         multiple = config.options.network.multiple

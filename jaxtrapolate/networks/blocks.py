@@ -22,6 +22,9 @@ Activation = Literal["none", "relu", "prelu"]
 HE = math.sqrt(6)
 """The gain of He et al. 2015, uniform."""
 
+LINEAR = math.sqrt(3)
+"""The same without an activation."""
+
 _GATES = ("none", "light", "full")
 _ACTIVATIONS = ("none", "relu", "prelu")
 

@@ -14,7 +14,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_array, check_present
-from jaxtrapolate.networks.blocks import Gate, Layer, double, pad_to_multiple
+from jaxtrapolate.networks.blocks import HE, LINEAR, Gate, Layer, double, pad_to_multiple
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +28,9 @@ class ExtraNetConfig:
         warps: warped images of three channels in x; with 1 there is no occlusion composite (Table 7, "w/o OMV").
         features: channels of the target's buffers; 0 for none.
         histories: warped rendered frames; 0 leaves out their encoder (Table 7, "w/o HE").
+        norm: whether layers have batch norms; without them initial weights keep the size of signals, ours.
+        direct: whether the encoder of the frame sees the histories too, at full resolution; ours, not the paper's.
+        contrast: where above 0, all images but x's first are shown as their difference to that one, times this; ours.
     """
 
     widths: tuple[int, ...] = (24, 24, 32, 32)
@@ -35,6 +38,9 @@ class ExtraNetConfig:
     warps: int = 2
     features: int = 6
     histories: int = 3
+    norm: bool = True
+    direct: bool = False
+    contrast: float = 0.0
 
     @property
     def multiple(self) -> int:
@@ -64,11 +70,20 @@ class ExtraNet(nnx.Module):
     def __init__(self, config: ExtraNetConfig = ExtraNetConfig(), *, rngs: nnx.Rngs):
         widths, gate = config.widths, config.gate
         self.config = config
-        inputs = 2 * 3 * config.warps + config.features
+        inputs = 2 * 3 * config.warps + config.features + (4 * config.histories if config.direct else 0)
+        usual: dict[str, Any] = {"rngs": rngs}
+        gated: dict[str, Any] = {"gate": gate, "rngs": rngs}
         bare: dict[str, Any] = {"norm": False, "activation": "none", "rngs": rngs}
+        last = bare
+        if not config.norm:
+            opened = 1.0 if gate == "none" else 2.0  # a gate is half open at first
+            usual |= {"norm": False, "gain": HE}
+            gated |= {"norm": False, "gain": opened * HE}
+            last = bare | {"gain": 0.05}
+            bare = bare | {"gain": opened * LINEAR}
 
         def pair(before, after):
-            return [Layer(before, after, gate=gate, rngs=rngs), Layer(after, after, gate=gate, rngs=rngs)]
+            return [Layer(before, after, **gated), Layer(after, after, **gated)]
 
         self.encoder = nnx.List([nnx.Sequential(*pair(inputs, widths[0]))])
         for before, after in pairwise(widths):
@@ -81,8 +96,8 @@ class ExtraNet(nnx.Module):
         if config.histories:
             stages, before = [], 4
             for after in widths[1:]:
-                stages += [Layer(before, after, stride=2, rngs=rngs)]
-                stages += [Layer(after, after, rngs=rngs) for _ in range(2)]
+                stages += [Layer(before, after, stride=2, **usual)]
+                stages += [Layer(after, after, **usual) for _ in range(2)]
                 before = after
             self.history = nnx.Sequential(*stages)
             self.merge = Layer(config.histories * deepest, deepest, gate=gate, **bare)
@@ -90,9 +105,9 @@ class ExtraNet(nnx.Module):
         for skip in widths[-2::-1]:
             inputs = skip + below
             middle = inputs // 2
-            self.decoder.append(nnx.Sequential(Layer(inputs, middle, rngs=rngs), Layer(middle, skip, rngs=rngs)))
+            self.decoder.append(nnx.Sequential(Layer(inputs, middle, **usual), Layer(middle, skip, **usual)))
             below = skip
-        self.output = Layer(widths[0], 3, size=1, **bare)
+        self.output = Layer(widths[0], 3, size=1, **last)
 
     def __call__(
         self,
@@ -124,20 +139,32 @@ class ExtraNet(nnx.Module):
         config = self.config
         batch, height, width, _ = check_array("x", x, shape=("B", "H", "W", 3 * config.warps))
         check_array("mask", mask, shape=(batch, height, width, 1))
-        inputs = [x, x * mask]
+        first = x[..., :3]
+
+        def shown(image):
+            return config.contrast * (image - first) if config.contrast else image
+
+        x_shown = jnp.concatenate([first, *(shown(x[..., k : k + 3]) for k in range(3, 3 * config.warps, 3))], -1)
+        inputs = [x_shown, x_shown * mask]
         if config.features:
             features = check_present("features", features, needed_by="this network")
             check_array("features", features, shape=(batch, height, width, config.features))
             inputs.append(features)
+        if config.histories:
+            history = check_present("history", history, needed_by="this network")
+            check_array("history", history, shape=(batch, config.histories, height, width, 4))
+            if config.contrast:
+                images = config.contrast * (history[..., :3] - first[:, None])
+                history = jnp.concatenate([images, history[..., 3:]], -1)
+            if config.direct:
+                inputs += list(jnp.moveaxis(history, 1, 0))
         value = pad_to_multiple(jnp.concatenate(inputs, -1), config.multiple)
         skips = []
         for level in self.encoder:
             value = level(value)
             skips.append(value)
         value = skips.pop()
-        if config.histories:
-            history = check_present("history", history, needed_by="this network")
-            check_array("history", history, shape=(batch, config.histories, height, width, 4))
+        if history is not None and config.histories:
             value = jnp.concatenate([value, self._encode(history)], -1)
         for level in self.decoder:
             value = level(jnp.concatenate([skips.pop(), double(value)], -1))
@@ -211,8 +238,7 @@ def extranet_from_torch(state_dict: Mapping[str, np.ndarray], *, config: ExtraNe
         else:
             put_convolution(layer.feature, f"{name}.conv_feature")
             put_convolution(layer.gate, f"{name}.conv_mask.0")
-        if norm is not None:
-            assert layer.norm is not None
+        if norm is not None and layer.norm is not None:
             put(layer.norm.scale, f"{norm}.weight")
             put(layer.norm.bias, f"{norm}.bias")
             put(layer.norm.mean, f"{norm}.running_mean")

@@ -4,12 +4,14 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxtrapolate.checks import Size
 from jaxtrapolate.records import Camera, Frame, GBuffer, replace
 
 T = TypeVar("T")
+
+_LEAST = 1e-9  # weight of a pixel that has none, so that there is always one to choose
 
 Flag = bool | Bool[Array, ""]
 
@@ -75,7 +77,7 @@ def _flip(frame: Frame, horizontal: Flag, vertical: Flag) -> Frame:
     return replace(frame, **fields)
 
 
-def crop(tree: T, key: PRNGKeyArray, *, size: Size) -> T:
+def crop(tree: T, key: PRNGKeyArray, *, size: Size, weight: Float[Array, "h w 1"] | None = None) -> T:
     """Cut the same random rectangle of `size` `(H, W)` out of all images `[H, W, ...]` of a pytree.
 
     Every leaf is one. Cut what has been warped, not what is still to be warped: motion leads out of a crop.
@@ -84,6 +86,8 @@ def crop(tree: T, key: PRNGKeyArray, *, size: Size) -> T:
         tree: images of one size.
         key: of the place, which is uniform over all those inside the frame.
         size: of the crop.
+        weight: how likely a pixel is the one around which the crop is laid, anywhere in it and inside the frame; not
+            negative. What has no weight is almost never chosen.
 
     Raises:
         ValueError: leaves of different sizes, or smaller than `size`.
@@ -95,7 +99,14 @@ def crop(tree: T, key: PRNGKeyArray, *, size: Size) -> T:
     if whole[0] < size[0] or whole[1] < size[1]:
         raise ValueError(f"size: expected at most the images' {list(whole)}, got {list(size)}")
     room = jnp.array([whole[0] - size[0] + 1, whole[1] - size[1] + 1])
-    top, left = jax.random.randint(key, (2,), 0, room)
+    if weight is None:
+        top, left = jax.random.randint(key, (2,), 0, room)
+    else:
+        choice, shift = jax.random.split(key)
+        total = jnp.cumsum(jnp.where(jnp.isfinite(weight), weight, 0).reshape(-1) + _LEAST)
+        chosen = jnp.searchsorted(total, total[-1] * jax.random.uniform(choice, (), total.dtype))
+        place = jnp.array(jnp.unravel_index(chosen, whole)) - jax.random.randint(shift, (2,), 0, jnp.array(size))
+        top, left = jnp.clip(place, 0, room - 1)
 
     def cut(image: Array) -> Array:
         zeros = (0,) * (image.ndim - 2)

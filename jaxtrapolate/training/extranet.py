@@ -12,7 +12,7 @@ from jaxtyping import Array, PRNGKeyArray
 
 from jaxtrapolate.checks import Size, check_present
 from jaxtrapolate.evaluation import Window
-from jaxtrapolate.losses import extranet_loss
+from jaxtrapolate.losses import extranet_loss, relative_loss
 from jaxtrapolate.methods.extranet import Preparation, encoded_truth, extranet, extranet_config
 from jaxtrapolate.methods.stages import demodulated
 from jaxtrapolate.metrics import psnr
@@ -39,7 +39,10 @@ class ExtraNetOptions:
         crop: `(H, W)` of an item, a multiple of the network's.
         space: where errors are measured: "log" of the light, as in the paper; or "display", the image after a tone
             curve, where an error under a dark albedo counts as little as it is seen.
+        loss: "extranet", `extranet_loss`; or "relative", `relative_loss` against the first guess.
         hole_weight, shade_weight, shade, shade_fraction: of `extranet_loss`.
+        crops: "even", anywhere; or "error", around pixels drawn by the first guess's squared error, so that the mean of
+            the relative loss over crops is about that over frames.
         validation: windows that validation looks at.
     """
 
@@ -48,10 +51,12 @@ class ExtraNetOptions:
     windows: WindowOptions = dataclasses.field(default_factory=WindowOptions)
     crop: Size = (128, 128)
     space: Literal["log", "display"] = "log"
+    loss: Literal["extranet", "relative"] = "extranet"
     hole_weight: float = 1.0
     shade_weight: float = 1.0
     shade: Literal["release", "paper"] = "release"
     shade_fraction: float = 0.1
+    crops: Literal["even", "error"] = "even"
     validation: int = 36
 
     def __post_init__(self) -> None:
@@ -97,7 +102,19 @@ class ExtraNetTask:
         inputs = {name: value for name, value in values["inputs"].items() if value is not None}
         if "history" in inputs:
             inputs["history"] = jnp.moveaxis(inputs["history"], 0, 2)  # [H, W, N, 4]: crops cut the leading axes
-        return inputs | {"target": target, "divisor": jnp.broadcast_to(divisor, color.shape).astype(target.dtype)}
+        example = inputs | {"target": target, "divisor": jnp.broadcast_to(divisor, color.shape).astype(target.dtype)}
+        if self.options.crops == "error":
+            made, truth = self._measured(inputs["x"][..., :3], example)
+            example["weight"] = jnp.nan_to_num(jnp.mean(jnp.square(made - truth), -1, keepdims=True))
+        return example
+
+    def _measured(self, light: Array, example: Example) -> tuple[Array, Array]:
+        """An image and the truth where errors are measured."""
+        images = light, example["target"]
+        if self.options.space == "log":
+            return images
+        made, truth = (_display(image, example["divisor"]) for image in images)
+        return made, truth
 
     def init(self, rngs: nnx.Rngs) -> nnx.Module:
         """A new network."""
@@ -109,14 +126,16 @@ class ExtraNetTask:
 
     def sample(self, example: Example, key: PRNGKeyArray) -> Batch:
         """A random crop."""
-        return crop(example, key, size=self.options.crop)
+        weight = example.pop("weight") if "weight" in (example := dict(example)) else None
+        return crop(example, key, size=self.options.crop, weight=weight)
 
     def loss(self, model: nnx.Module, batch: Batch) -> tuple[Array, Mapping[str, Array]]:
-        """`extranet_loss` in the space that the options say, its mean over the batch."""
+        """The loss in the space that the options say, its mean over the batch."""
         o = self.options
-        made, truth = _answer(model, batch), batch["target"]
-        if o.space == "display":
-            made, truth = (_display(light, batch["divisor"]) for light in (made, truth))
+        made, truth = self._measured(_answer(model, batch), batch)
+        if o.loss == "relative":
+            guess, _ = self._measured(batch["x"][..., :3], batch)
+            return jnp.mean(jax.vmap(relative_loss)(made, truth, guess)), {}
         how: dict[str, Any] = {"hole_weight": o.hole_weight, "shade_weight": o.shade_weight}
         how |= {"shade": o.shade, "fraction": o.shade_fraction}
         total, parts = jax.vmap(lambda *a: extranet_loss(*a, **how))(made, truth, batch["mask"].astype(jnp.float32))
