@@ -31,7 +31,7 @@ from jaxtrapolate.causes import CAUSES
 from jaxtrapolate.evaluation import arguments, causes_of, mean_over_frames, score, windows
 from jaxtrapolate.files.atomic import atomic_path
 from jaxtrapolate.methods.extranet import Preparation
-from jaxtrapolate.networks.extranet import GATED_CONVOLUTION, ExtraNetConfig
+from jaxtrapolate.networks.extranet import ExtraNetConfig
 from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence
 from jaxtrapolate.timing import machine
 from jaxtrapolate.training import Config, ExtraNetOptions, ExtraNetTask, Optimizer, train_and_evaluate
