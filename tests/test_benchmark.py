@@ -166,3 +166,56 @@ def test_machine_tells_what_figures_depend_on(monkeypatch):
     assert about["settings"]["MALLOC_ARENA_MAX"] == "1"
     assert about["settings"]["JAX_COMPILATION_CACHE_DIR"] == "cache"
     json.dumps(about)
+
+
+@pytest.fixture
+def networks(operations, monkeypatch):
+    """The script of the networks, after that of the operations, which it takes some functions from."""
+    monkeypatch.delitem(sys.modules, "networks", raising=False)
+    module = importlib.import_module("networks")
+    monkeypatch.setattr(module, "confine", lambda threads, allocator: None)
+    yield module
+    sys.modules.pop("networks", None)
+
+
+def run_networks(networks, folder, *options):
+    output = folder / "networks.json"
+    status = networks.main(["--sizes", SIZE, "--repeats", "2", "--output", str(output), *options])
+    return status, json.loads(output.read_text())
+
+
+@pytest.mark.slow
+def test_networks_without_peers(networks, tmp_path, monkeypatch, capsys):
+    for name in ("torch", "openvino"):
+        monkeypatch.setitem(sys.modules, name, None)
+    status, results = run_networks(networks, tmp_path)
+    assert status == 0
+    assert [row["network"] for row in results["networks"]] == list(networks.NETWORKS)
+    light, full, gated, _ = (row["gflop"] for row in results["networks"])
+    assert gated < light < full
+    for row in results["networks"]:
+        assert (row["height"], row["width"], row["peers"]) == (24, 40, {})
+        assert row["ms"]["median"] > 0
+    assert "extranet, full gates" in capsys.readouterr().out
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["networks.json"]
+
+
+@pytest.mark.slow
+def test_networks_of_pytorch_and_openvino_agree(networks, tmp_path):
+    pytest.importorskip("torch")
+    status, results = run_networks(networks, tmp_path, "--only", "extranet;gated convolution")
+    assert status == 0
+    for row in results["networks"]:
+        assert {"torch", "torch, channels last"} <= set(row["peers"])
+        for entry in row["peers"].values():
+            assert entry["difference"]["share"] == 0
+            assert entry["ratio"] > 0
+
+
+def test_networks_that_are_not_there(networks, tmp_path, capsys):
+    with pytest.raises(SystemExit) as caught:
+        run_networks(networks, tmp_path, "--only", "unet")
+    assert caught.value.code == 2
+    assert (
+        "expected extranet; extranet, full gates; gated convolution; interpolator, got unet" in capsys.readouterr().err
+    )
