@@ -323,6 +323,17 @@ def test_contrast_is_a_network_that_is_shown_differences(direct):
     np.testing.assert_allclose(*answers, atol=1e-5)
 
 
+def test_contrast_of_a_single_warped_image_changes_histories_alone():
+    size = {"widths": (3, 4), "features": 2, "histories": 2, "warps": 1}
+    with_contrast = ExtraNet(ExtraNetConfig(**size, contrast=3.0), rngs=nnx.Rngs(0))
+    plain = ExtraNet(ExtraNetConfig(**size), rngs=nnx.Rngs(1))
+    nnx.update(plain, nnx.state(with_contrast))
+    x, mask, features, history = (jnp.asarray(random(1, *s, seed=k)) for k, s in enumerate(shapes_of(9, 14)))
+    x = x[..., :3]
+    other = jnp.concatenate([3 * (history[..., :3] - x[:, None]), history[..., 3:]], -1)
+    np.testing.assert_allclose(with_contrast(x, mask, features, history), plain(x, mask, features, other), atol=1e-5)
+
+
 def shapes_of(height, width):
     return (height, width, 6), (height, width, 1), (height, width, 2), (2, height, width, 4)
 

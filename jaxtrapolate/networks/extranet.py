@@ -60,11 +60,12 @@ class ExtraNet(nnx.Module):
 
     Args:
         config: sizes and what is left out.
-        rngs: `nnx.Rngs(params=...)`; the initialisation is PyTorch's default, as in the paper.
+        rngs: `nnx.Rngs(params=...)`; the initialisation is PyTorch's default, as in the paper, but without batch norms.
 
     References:
         Guo et al. 2021, sections 4.3 and 4.4. In training the histories share one batch norm's statistics, taken over
-        all of them at once; the release takes them of one history after the other. Evaluated, both are the same.
+        all of them at once; the release takes them of one history after the other. Evaluated, both are the same. What
+        `norm`, `direct` and `contrast` change, and what each is worth, is in experiments/README.md.
     """
 
     def __init__(self, config: ExtraNetConfig = ExtraNetConfig(), *, rngs: nnx.Rngs):
@@ -74,13 +75,12 @@ class ExtraNet(nnx.Module):
         usual: dict[str, Any] = {"rngs": rngs}
         gated: dict[str, Any] = {"gate": gate, "rngs": rngs}
         bare: dict[str, Any] = {"norm": False, "activation": "none", "rngs": rngs}
-        last = bare
+        last: dict[str, Any] = dict(bare)
         if not config.norm:
             opened = 1.0 if gate == "none" else 2.0  # a gate is half open at first
             usual |= {"norm": False, "gain": HE}
             gated |= {"norm": False, "gain": opened * HE}
-            last = bare | {"gain": 0.05}
-            bare = bare | {"gain": opened * LINEAR}
+            bare["gain"], last["gain"] = opened * LINEAR, 0.05
 
         def pair(before, after):
             return [Layer(before, after, **gated), Layer(after, after, **gated)]
@@ -139,37 +139,40 @@ class ExtraNet(nnx.Module):
         config = self.config
         batch, height, width, _ = check_array("x", x, shape=("B", "H", "W", 3 * config.warps))
         check_array("mask", mask, shape=(batch, height, width, 1))
-        first = x[..., :3]
-
-        def shown(image):
-            return config.contrast * (image - first) if config.contrast else image
-
-        x_shown = jnp.concatenate([first, *(shown(x[..., k : k + 3]) for k in range(3, 3 * config.warps, 3))], -1)
-        inputs = [x_shown, x_shown * mask]
-        if config.features:
-            features = check_present("features", features, needed_by="this network")
-            check_array("features", features, shape=(batch, height, width, config.features))
-            inputs.append(features)
-        if config.histories:
-            history = check_present("history", history, needed_by="this network")
-            check_array("history", history, shape=(batch, config.histories, height, width, 4))
-            if config.contrast:
-                images = config.contrast * (history[..., :3] - first[:, None])
-                history = jnp.concatenate([images, history[..., 3:]], -1)
-            if config.direct:
-                inputs += list(jnp.moveaxis(history, 1, 0))
+        inputs, history = self._inputs(x, mask, features, history)
         value = pad_to_multiple(jnp.concatenate(inputs, -1), config.multiple)
         skips = []
         for level in self.encoder:
             value = level(value)
             skips.append(value)
         value = skips.pop()
-        if history is not None and config.histories:
+        if history is not None:
             value = jnp.concatenate([value, self._encode(history)], -1)
         for level in self.decoder:
             value = level(jnp.concatenate([skips.pop(), double(value)], -1))
         residual = self.output(value)[:, :height, :width]
         return x[..., :3] + residual.astype(x.dtype)
+
+    def _inputs(self, x, mask, features, history):
+        """What the frame's encoder is shown, each `[B, H, W, C]`, and what the histories' is."""
+        config, size = self.config, x.shape[:3]
+        if config.contrast:
+            first = x[..., :3]
+            others = x[..., 3:].reshape(*size, config.warps - 1, 3) - first[..., None, :]
+            x = jnp.concatenate([first, config.contrast * others.reshape(*size, 3 * config.warps - 3)], -1)
+        inputs = [x, x * mask]
+        if config.features:
+            features = check_present("features", features, needed_by="this network")
+            check_array("features", features, shape=(*size, config.features))
+            inputs.append(features)
+        if not config.histories:
+            return inputs, None
+        history = check_present("history", history, needed_by="this network")
+        check_array("history", history, shape=(size[0], config.histories, *size[1:], 4))
+        if config.contrast:
+            images = config.contrast * (history[..., :3] - first[:, None])
+            history = jnp.concatenate([images, history[..., 3:]], -1)
+        return inputs + (list(jnp.moveaxis(history, 1, 0)) if config.direct else []), history
 
     def _encode(self, history):
         """All histories in one pass through their common encoder, then merged: `[B, h, w, C]`."""
