@@ -15,12 +15,13 @@ import jaxtrapolate as jx
 from jaxtrapolate import weights
 from jaxtrapolate.commands.inputs import open_methods
 from jaxtrapolate.commands.main import main
-from jaxtrapolate.evaluation import hide
+from jaxtrapolate.evaluation import arguments, causes_of, hide, score, windows
 from jaxtrapolate.files import write_unreal_frame
 from jaxtrapolate.methods import extranet as module
 from jaxtrapolate.methods.extranet import RELEASE, Preparation, extranet
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
 from jaxtrapolate.records import replace
+from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence
 
 SMALL = ExtraNetConfig(widths=(4, 6))
 SIZE = (9, 13)
@@ -444,18 +445,44 @@ def test_stages_before_are_named(methods):
 # Weights
 
 
-def test_there_are_no_default_weights_yet():
-    assert "extranet" in jx.method_names()
-    with pytest.raises(ValueError, match="method 'extranet': no default weights come with this version") as caught:
-        jx.load("extranet")
-    assert "\n" not in str(caught.value)
+def test_default_weights_are_of_the_public_layout():
+    """The bare network takes x, mask, features and history as the authors' does; a file tells what it is."""
+    method = jx.load("extranet")
+    x, mask, features, history = (
+        jnp.asarray(oracles.random(*shape, seed=k))
+        for k, shape in enumerate(((9, 13, 6), (9, 13, 1), (9, 13, 6), (3, 9, 13, 4)))
+    )
+    answer = method.network(x, mask, features, history)
+    assert answer.shape == (9, 13, 3)
+    assert np.isfinite(answer).all()
+    path = weights.default_weights("extranet")
+    assert path.stat().st_size <= weights.files.LARGEST
+    assert len(weights.load_weights(path).note) > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["walkers", "interior", "terrain"])
+def test_default_weights_are_ahead_of_their_inputs(name):
+    """On test seeds, by at least a decibel over the warp and the occlusion composite, and ahead of the guided warp."""
+    sequence = SceneSequence(name, TEST_SEEDS[1], frames=10, size=(90, 160))
+    methods = {m: jx.load(m) for m in ("occlusion_warp", "guided_warp", "extranet")}
+    decibels = {m: [] for m in methods}
+    for window in windows(sequence, [7, 9], past=3):
+        causes = causes_of(sequence, window)
+        for m, method in methods.items():
+            image = method(*arguments(method, window))
+            decibels[m].append(score(image, window, causes, None, hdr=True)["psnr"])
+    mean = {m: np.mean(values) for m, values in decibels.items()}
+    assert mean["extranet"] > mean["occlusion_warp"] + 1
+    assert mean["extranet"] > mean["guided_warp"]
 
 
 @pytest.fixture(scope="module")
 def saved(model, tmp_path_factory):
     folder = tmp_path_factory.mktemp("weights")
     preparation = dataclasses.replace(RELEASE, first_guess="guided")
-    return module.save_extranet(folder, model, preparation=preparation, note="random")
+    config = module.extranet_config(model.config, preparation)
+    return weights.save_weights(folder, "extranet", nnx.to_pure_dict(nnx.state(model)), config=config, note="random")
 
 
 def test_weights_state_their_preparation(model, saved):
@@ -532,7 +559,8 @@ def run(capsys, *arguments):
     return code, out, err
 
 
-def test_commands_without_weights_say_so(capsys, dump, tmp_path):
+def test_commands_without_weights_say_so(capsys, dump, tmp_path, monkeypatch):
+    monkeypatch.setattr(weights.files, "_SHIPPED", tmp_path)
     reason = "no default weights come with this version"
     code, out, _ = run(capsys, "check", dump)
     assert code == 0
@@ -603,16 +631,16 @@ def test_import_weights(capsys, saved, tmp_path):
     assert code == 0
     (path,) = tmp_path.glob("mine-*.npz")
     assert str(path) in out
-    given, found = weights.load_weights(saved), weights.load_weights(path)
-    assert weights.fingerprint(found.tree) == weights.fingerprint(given.tree)
-    assert found.config == given.config
+    before, found = weights.load_weights(saved), weights.load_weights(path)
+    assert weights.fingerprint(found.tree) == weights.fingerprint(before.tree)
+    assert found.config == before.config
     assert found.note == f"imported from {saved.name}"
-    for arguments, message in (
+    for given, message in (
         ((tmp_path / "none.pth.tar",), "does not exist"),
         ((saved, "--output", tmp_path / "a.tar"), "ends in .npz"),
         ((saved, "--output", tmp_path / "none" / "a.npz"), "its folder does not exist"),
     ):
-        code, _, err = run(capsys, "import-weights", *arguments)
+        code, _, err = run(capsys, "import-weights", *given)
         assert (code, err.count("\n")) == (2, 1)
         assert message in err
 

@@ -4,12 +4,15 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
+from flax import nnx
 from rich.console import Console
 
 from jaxtrapolate.files import InputError
 from jaxtrapolate.files.atomic import os_input_error
 from jaxtrapolate.methods import load
-from jaxtrapolate.methods.extranet import load_extranet, save_extranet
+from jaxtrapolate.methods.extranet import extranet_config, load_extranet
 from jaxtrapolate.weights import load_orbax, save_weights
 
 
@@ -28,6 +31,9 @@ def add_parser(subparsers: Any) -> None:
         metavar="FILE.npz",
         help="where to, by default the method's name; a part of the file's hash is put into it (extranet-1a2b3c4d.npz)",
     )
+    parser.add_argument(
+        "--half", action="store_true", help="kept in float16: a file half as large; a file holds at most 2 MB"
+    )
     parser.add_argument("--note", metavar="TEXT", help="a line that is kept in the file: how they were made")
     parser.set_defaults(run=run)
 
@@ -45,14 +51,15 @@ def run(options: argparse.Namespace) -> None:
             if weights.method is None:
                 raise InputError(f"{source}: does not say of which method these weights are")
             load(weights.method, weights=source)  # it fits
-            note = options.note or weights.note
-            path = save_weights(folder, weights.method, weights.tree, config=weights.config, note=note, name=stem)
-            method = weights.method
+            method, tree, about = weights.method, weights.tree, (weights.config, weights.note)
         else:
             model, preparation = load_extranet(source)
-            note = options.note or f"imported from {source.name}"
-            path = save_extranet(folder, model, preparation=preparation, note=note, name=stem)
-            method = "extranet"
+            method, tree = "extranet", nnx.to_pure_dict(nnx.state(model))
+            about = extranet_config(model.config, preparation), f"imported from {source.name}"
+        if options.half:
+            tree = jax.tree.map(lambda array: np.asarray(array, np.float16), tree)
+        config, note = about
+        path = save_weights(folder, method, tree, config=config, note=options.note or note, name=stem)
     except OSError as error:
         raise os_input_error(source, error) from error
     except ValueError as error:

@@ -35,7 +35,7 @@ from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.networks.stored import load_network
 from jaxtrapolate.radiance import By, demodulate, log_decode, log_encode
 from jaxtrapolate.records import GBuffer
-from jaxtrapolate.weights import configured, read_torch, save_weights
+from jaxtrapolate.weights import configured, read_torch
 
 _NAME = "extranet"
 
@@ -271,14 +271,6 @@ def load_extranet(path: str | PathLike[str]) -> tuple[ExtraNet, Preparation]:
 def extranet_config(config: ExtraNetConfig, preparation: Preparation) -> dict[str, Any]:
     """What a file of weights states about them, as `load_extranet` reads it."""
     return {"network": dataclasses.asdict(config), "preparation": dataclasses.asdict(preparation)}
-
-
-def save_extranet(
-    directory: str | PathLike[str], model: ExtraNet, *, preparation: Preparation, note: str, name: str | None = None
-) -> Path:
-    """Writes a network and its preparation to a file that `load_extranet` reads; see `save_weights`."""
-    tree, config = nnx.to_pure_dict(nnx.state(model)), extranet_config(model.config, preparation)
-    return save_weights(directory, _NAME, tree, config=config, note=note, name=name)
 
 
 def load(path: str | PathLike[str]) -> Method:
