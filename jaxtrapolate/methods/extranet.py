@@ -188,7 +188,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
     oldest is repeated. The network sees x `[H, W, 6]` (the first guess and the occlusion composite), mask `[H, W, 1]`,
     features `[H, W, 6]` and history `[3, H, W, 4]`, oldest first, all in the log domain: these are `values["inputs"]`
     of the stages before "network". Its answer is decoded and modulated. The sky is the engine's where it draws it
-    apart, else that of the newest frame, warped.
+    apart, else that of the newest frame, warped as the first guess is.
 
     What a scene lacks is left out: no albedo, no demodulation; no depth, no occlusion motion, the composite is the
     warp; normal, depth, roughness or metallic that are absent are zeros; masks are those that the buffers allow.
@@ -208,6 +208,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
     if config.features not in (0, 6) or not 1 <= config.warps <= 2:
         raise ValueError(f"model: expected 6 features or none and 1 or 2 warped images, got {config}")
     function, state = inference(model)
+    guided = (dataclasses.replace(GUIDED, optional=True),) if preparation.first_guess == "guided" else ()
 
     def warp(state, values: Values):
         pairs = zip(layers(values), values["motions"], strict=True)
@@ -217,14 +218,14 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
     def network(state, values: Values):
         inputs = values["inputs"]
         image = log_decode(function(state, *(inputs[name] for name in ("x", "mask", "features", "history"))))
-        return {"warped": image, "image": image}
+        return {"warped": image, "image": image, "guess": values["warped"]}
 
     def sky(state, values: Values):
-        plain = composite(values, values["newest"].color)
+        # the guided warp finds like sky where the occluder has moved on; the sky is not divided by anything
+        plain = values["guess"] if guided and preparation.sky else composite(values, values["newest"].color)
         return {"image": jnp.where(values["target"].gbuffer.sky > 0.5, plain, values["image"])}
 
     demodulation: dict[str, Any] = {"floor": preparation.floor, "sky": preparation.sky}
-    guided = (dataclasses.replace(GUIDED, optional=True),) if preparation.first_guess == "guided" else ()
     past = max(1, config.histories)
     stages = (
         reproject_stage(past),
