@@ -442,6 +442,21 @@ def test_stages_before_are_named(methods):
         methods["ours"].values_before("networks", methods["ours"].state, (), history, target)
 
 
+@pytest.mark.parametrize("rendered", [1, 3])
+def test_what_stands_still_is_returned(model, rendered):
+    """Three equal rendered frames and no motion: the newest, exactly; of one alone nothing is known."""
+    history, target = make_window(rendered=rendered)
+    first = history[0]
+    motion = jnp.zeros_like(target.motion)
+    still = tuple(replace(first, motion=motion, color=None if f.color is None else first.color) for f in history)
+    image = extranet(model)(still, replace(target, gbuffer=first.gbuffer, motion=motion))
+    known = np.maximum(np.asarray(first.color), 0)
+    if rendered == 3:
+        np.testing.assert_allclose(image, first.color, rtol=1e-5, atol=1e-6)
+    else:
+        assert np.abs(np.asarray(image) - known).max() > 1e-3
+
+
 # Weights
 
 

@@ -188,7 +188,8 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
     oldest is repeated. The network sees x `[H, W, 6]` (the first guess and the occlusion composite), mask `[H, W, 1]`,
     features `[H, W, 6]` and history `[3, H, W, 4]`, oldest first, all in the log domain: these are `values["inputs"]`
     of the stages before "network". Its answer is decoded and modulated. The sky is the engine's where it draws it
-    apart, else that of the newest frame, warped as the first guess is.
+    apart, else that of the newest frame, warped as the first guess is. Where all warped frames are equal, in the whole
+    frame, so is the result: nothing is corrected where nothing has changed.
 
     What a scene lacks is left out: no albedo, no demodulation; no depth, no occlusion motion, the composite is the
     warp; normal, depth, roughness or metallic that are absent are zeros; masks are those that the buffers allow.
@@ -218,6 +219,9 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
     def network(state, values: Values):
         inputs = values["inputs"]
         image = log_decode(function(state, *(inputs[name] for name in ("x", "mask", "features", "history"))))
+        if len(values["histories"]) > 1:  # with one alone it is not known whether anything changes
+            newest, *older = values["histories"]
+            image = jnp.where(jnp.all(jnp.stack([jnp.all(one == newest) for one in older])), values["warped"], image)
         return {"warped": image, "image": image, "guess": values["warped"]}
 
     def sky(state, values: Values):
