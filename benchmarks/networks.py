@@ -3,8 +3,8 @@
     python benchmarks/networks.py --sizes 720p --threads 1 --output networks.json
 
 The weights are random; batch norms are folded for everyone. Each peer's answer is compared with ours before it is
-timed. All that belongs to one network and size is timed in turn; a ratio is the median over the rounds of our time over the
-peer's, less is better. Compilation is apart. On a GPU ours is timed in each precision, peers are not.
+timed. All that belongs to one network and size is timed in turn; a ratio is the median over the rounds of our time over
+the peer's, less is better. Compilation is apart. On a GPU ours is timed in each precision, peers are not.
 """
 
 import argparse
