@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.checks import check_choice
 from jaxtrapolate.gather import backward_warp
 from jaxtrapolate.holes import Taps
-from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.method import Method, Stage, Values, rendered
 from jaxtrapolate.methods.stages import (
     OCCLUSION,
     SKY,
@@ -188,8 +188,8 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
     oldest is repeated. The network sees x `[H, W, 6]` (the first guess and the occlusion composite), mask `[H, W, 1]`,
     features `[H, W, 6]` and history `[3, H, W, 4]`, oldest first, all in the log domain: these are `values["inputs"]`
     of the stages before "network". Its answer is decoded and modulated. The sky is the engine's where it draws it
-    apart, else that of the newest frame, warped as the first guess is. Where all warped frames are equal, in the whole
-    frame, so is the result: nothing is corrected where nothing has changed.
+    apart, else that of the newest frame, warped as the first guess is. Where nothing moves and all rendered frames are
+    equal, in the whole frame, the newest is the result.
 
     What a scene lacks is left out: no albedo, no demodulation; no depth, no occlusion motion, the composite is the
     warp; normal, depth, roughness or metallic that are absent are zeros; masks are those that the buffers allow.
@@ -219,9 +219,12 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
     def network(state, values: Values):
         inputs = values["inputs"]
         image = log_decode(function(state, *(inputs[name] for name in ("x", "mask", "features", "history"))))
-        if len(values["histories"]) > 1:  # with one alone it is not known whether anything changes
-            newest, *older = values["histories"]
-            image = jnp.where(jnp.all(jnp.stack([jnp.all(one == newest) for one in older])), values["warped"], image)
+        history, motions = values["history"], values["motions"]
+        if len(motions) > 1:  # with one rendered frame it is not known whether anything changes
+            colors = [history[i].color for i in rendered(history)][: len(motions)]
+            same = [jnp.all(color == colors[0]) for color in colors[1:]]
+            still = jnp.all(jnp.stack(same + [jnp.all(motion == 0) for motion in motions]))
+            image = jnp.where(still, values["histories"][0], image)
         return {"warped": image, "image": image, "guess": values["warped"]}
 
     def sky(state, values: Values):
