@@ -9,13 +9,14 @@ resolution, images shown as differences, no batch norms.
 
 All variants see the same windows of training seeds, rendered once and kept in the workdir, and differ in nothing but
 what their name says; each is trained from several seeds. Scores are of the method on test seeds, mean over windows. A
-run that is there already is not trained again, so this can be stopped and gone on with.
+run that is there already is not trained again, so this can be stopped and gone on with, and several processes can share
+a workdir if their variants differ.
 """
 
 import argparse
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,7 @@ SIZE = (180, 320)
 UNSEEN = ("interior", "dock")
 """Scenes that are left out of the training of "seen scenes" and "one scene", and that these two are scored on."""
 ALONE = "walkers"
+UNLEARNED = ("warp", "occlusion_warp", "guided_warp")
 
 OURS = ExtraNetConfig(norm=False, direct=True, contrast=4.0)
 PLAIN = ExtraNetOptions(
@@ -193,32 +195,54 @@ def main() -> None:
     options.workdir.mkdir(parents=True, exist_ok=True)
     stored = {name: examples(name, options.windows, options.workdir) for name in MOVING}
     scorer = Scorer(options.frame)
-    found: dict[str, Any] = json.loads(options.output.read_text())["runs"] if options.output.exists() else {}
-    for name in ("warp", "occlusion_warp", "guided_warp"):
-        found.setdefault(name, {"0": scorer(jx.load(name), name)})
+    for name in UNLEARNED:
+        _keep(_place(options, name, 0), lambda name=name: scorer(jx.load(name), name))
     for seed in range(options.seeds):
-        for name in options.variants.split(","):
-            variant = VARIANTS[name]
-            if str(seed) in found.setdefault(name, {}):
-                continue
-            workdir = options.workdir / f"{name.replace(' ', '_')}-{seed}"
-            train_and_evaluate(
-                configuration(variant, options.steps, seed),
-                workdir,
-                task=Shared(variant, stored),
-                report=partial(print, name, seed, flush=True),
-            )
-            network = json.dumps(dataclasses.asdict(variant.options.network)) + variant.options.preparation.first_guess
-            found[name][str(seed)] = scorer(jx.load("extranet", weights=workdir / "model"), network)
-            _write(options, found)
-    _write(options, found)
+        for name in filter(None, options.variants.split(",")):
+            _keep(_place(options, name, seed), partial(_run, name, seed, options, stored, scorer))
+            _write(options)
+    _write(options)
 
 
-def _write(options: argparse.Namespace, found: dict[str, Any]) -> None:
-    rows = {name: summary(list(runs.values())) for name, runs in found.items() if runs}
-    unseen = {name: summary(list(runs.values()), UNSEEN) for name, runs in found.items() if runs}
+def _run(
+    name: str, seed: int, options: argparse.Namespace, stored: Mapping[str, Mapping[str, np.ndarray]], scorer: Scorer
+) -> list[dict[str, Any]]:
+    variant, workdir = VARIANTS[name], _place(options, name, seed)
+    train_and_evaluate(
+        configuration(variant, options.steps, seed),
+        workdir,
+        task=Shared(variant, stored),
+        report=partial(print, name, seed, flush=True),
+    )
+    key = json.dumps(dataclasses.asdict(variant.options.network)) + variant.options.preparation.first_guess
+    return scorer(jx.load("extranet", weights=workdir / "model"), key)
+
+
+def _place(options: argparse.Namespace, name: str, seed: int) -> Path:
+    return options.workdir / f"{name.replace(' ', '_')}-{seed}"
+
+
+def _keep(place: Path, make: Callable[[], list[dict[str, Any]]]) -> None:
+    """Scores of a run beside its folder: made if they are not there."""
+    path = place.parent / f"{place.name}.json"
+    if not path.exists():
+        scores = make()
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(scores))
+
+
+def _write(options: argparse.Namespace) -> None:
+    """The table of all runs that are there, those of another process too."""
+    runs = {}
+    for name in (*UNLEARNED, *VARIANTS):
+        paths = sorted(options.workdir.glob(f"{name.replace(' ', '_')}-[0-9]*.json"))
+        if paths:
+            runs[name] = [json.loads(path.read_text()) for path in paths]
+    rows = {name: summary(of) for name, of in runs.items()}
+    unseen = {name: summary(of, UNSEEN) for name, of in runs.items()}
+    frames = {name: [[round(score["psnr"], 3) for score in scores] for scores in of] for name, of in runs.items()}
     given = {k: getattr(options, k) for k in ("steps", "windows", "frame")}
-    content = {"machine": machine(), **given, "all scenes": rows, f"on {' and '.join(UNSEEN)}": unseen, "runs": found}
+    content = {"machine": machine(), **given, "all scenes": rows, f"on {' and '.join(UNSEEN)}": unseen, "dB": frames}
     with atomic_path(options.output) as temporary:
         temporary.write_text(json.dumps(content, indent=1))
     table = Table(title="dB, mean of the test windows, +- spread over seeds")
@@ -227,7 +251,7 @@ def _write(options: argparse.Namespace, found: dict[str, Any]) -> None:
         table.add_column(column)
     for name, row in rows.items():
         cells = [_cell(row.get(column)) for column in columns] + [_cell(unseen[name]["psnr"])]
-        table.add_row(name, str(len(found[name])), *cells)
+        table.add_row(name, str(len(runs[name])), *cells)
     Console(width=160).print(table)
 
 

@@ -1,63 +1,21 @@
-"""ExtraNet as a method: what its network is shown, against loops from the facts; what is left out; its weights."""
+"""ExtraNet as a method: what its network is shown, against loops from the facts; what is left out."""
 
 import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-from flax import nnx
-from synthetic import make_frame, make_keyframe
+from small_extranet import SIZE, SMALL, image_of, make_window, random_model
 
 import jaxtrapolate as jx
-from jaxtrapolate import weights
-from jaxtrapolate.commands.inputs import open_methods
-from jaxtrapolate.commands.main import main
-from jaxtrapolate.evaluation import arguments, causes_of, hide, score, windows
-from jaxtrapolate.files import write_unreal_frame
 from jaxtrapolate.methods import extranet as module
 from jaxtrapolate.methods.extranet import RELEASE, Preparation, extranet
-from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
+from jaxtrapolate.networks.extranet import ExtraNetConfig
 from jaxtrapolate.records import replace
-from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence
 
-SMALL = ExtraNetConfig(widths=(4, 6))
-SIZE = (9, 13)
 OURS = Preparation()
-
-
-def make_window(size=SIZE, *, rendered=3, seed=0, sky=True):
-    """Random buffers in centimetres: `rendered` frames with colour in turn with frames without, then the target."""
-    height, width = size
-    frames = []
-    for time in range(2 * rendered):
-        rng = np.random.default_rng((seed, time))
-
-        def uniform(channels, low=0.0, high=1.0, rng=rng):
-            return rng.uniform(low, high, (height, width, channels)).astype(np.float32)
-
-        albedo = np.where(uniform(3) < 0.15, 0, uniform(3, 0.02)).astype(np.float32)
-        infinite = (uniform(1) < 0.15).astype(np.float32) if sky else np.zeros((height, width, 1), np.float32)
-        normal = np.float32([0.2, 0.1, 1]) + uniform(3, -0.3, 0.3)
-        normal = np.where(infinite > 0.5, 0, normal / np.linalg.norm(normal, axis=-1, keepdims=True))
-        buffers = jx.GBuffer(
-            albedo=albedo,
-            depth=np.where(infinite > 0.5, np.float32(3e6), uniform(1, 200, 5000)),
-            normal=normal.astype(np.float32),
-            position=uniform(3, 0, 40),
-            roughness=uniform(1),
-            metallic=uniform(1),
-            specular=uniform(1),
-            n_dot_v=uniform(1, -1),
-            stencil=np.floor(uniform(1, 0, 2.2)),
-            sky=infinite,
-        )
-        color, motion = uniform(3, -0.2, 4), oracles.random_motion(height, width, seed=seed + 10 * time)
-        frames.append(jx.Frame(color=color, gbuffer=buffers, motion=motion, time=float(time)))
-    *history, target = jax.device_put([frame if k % 2 == 0 else hide(frame) for k, frame in enumerate(frames)])
-    return tuple(history), target
 
 
 # The preparation in float64, one pixel after the other
@@ -154,20 +112,6 @@ def expected_inputs(history, target, release):
     }
 
 
-def random_model(config):
-    """A network with random weights; made from shapes alone, because an initialisation compiles layer by layer."""
-    structure, state = nnx.split(nnx.eval_shape(lambda: ExtraNet(config, rngs=nnx.Rngs(0))))
-    rng = np.random.default_rng(3)
-
-    def values(path, leaf):
-        low, high = (0.5, 1.5) if path[-1].key in ("var", "scale") else (-0.25, 0.25)
-        return jnp.asarray(rng.uniform(low, high, leaf.shape), leaf.dtype)
-
-    tree = jax.tree_util.tree_map_with_path(values, nnx.to_pure_dict(state))
-    nnx.replace_by_pure_dict(state, tree)
-    return nnx.merge(structure, state)
-
-
 @pytest.fixture(scope="module")
 def model():
     return random_model(SMALL)
@@ -179,11 +123,6 @@ def methods(model):
     return {
         name: extranet(model, preparation=p) for name, p in (("ours", OURS), ("release", RELEASE), ("guided", guided))
     }
-
-
-def image_of(method, history, target):
-    """Stage by stage, so that little is compiled anew."""
-    return np.asarray(method.function(method.state, (), history, target)[1])
 
 
 def inputs(method, history, target):
@@ -442,266 +381,16 @@ def test_stages_before_are_named(methods):
         methods["ours"].values_before("networks", methods["ours"].state, (), history, target)
 
 
-@pytest.mark.parametrize("rendered", [1, 3])
-def test_what_stands_still_is_returned(model, rendered):
+@pytest.mark.parametrize("name, rendered", [("ours", 1), ("ours", 3), ("guided", 3)])
+def test_what_stands_still_is_returned(methods, name, rendered):
     """Three equal rendered frames and no motion: the newest, exactly; of one alone nothing is known."""
     history, target = make_window(rendered=rendered)
     first = history[0]
     motion = jnp.zeros_like(target.motion)
     still = tuple(replace(first, motion=motion, color=None if f.color is None else first.color) for f in history)
-    image = extranet(model)(still, replace(target, gbuffer=first.gbuffer, motion=motion))
+    image = methods[name](still, replace(target, gbuffer=first.gbuffer, motion=motion))
     known = np.maximum(np.asarray(first.color), 0)
     if rendered == 3:
         np.testing.assert_allclose(image, first.color, rtol=1e-5, atol=1e-6)
     else:
         assert np.abs(np.asarray(image) - known).max() > 1e-3
-
-
-# Weights
-
-
-def test_default_weights_are_of_the_public_layout():
-    """The bare network takes x, mask, features and history as the authors' does; a file tells what it is."""
-    method = jx.load("extranet")
-    x, mask, features, history = (
-        jnp.asarray(oracles.random(*shape, seed=k))
-        for k, shape in enumerate(((9, 13, 6), (9, 13, 1), (9, 13, 6), (3, 9, 13, 4)))
-    )
-    answer = method.network(x, mask, features, history)
-    assert answer.shape == (9, 13, 3)
-    assert np.isfinite(answer).all()
-    path = weights.default_weights("extranet")
-    assert path.stat().st_size <= weights.files.LARGEST
-    assert len(weights.load_weights(path).note) > 20
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["walkers", "interior", "terrain"])
-def test_default_weights_are_ahead_of_their_inputs(name):
-    """On test seeds, by at least a decibel over the warp and the occlusion composite, and ahead of the guided warp."""
-    sequence = SceneSequence(name, TEST_SEEDS[1], frames=10, size=(90, 160))
-    methods = {m: jx.load(m) for m in ("occlusion_warp", "guided_warp", "extranet")}
-    decibels = {m: [] for m in methods}
-    for window in windows(sequence, [7, 9], past=3):
-        causes = causes_of(sequence, window)
-        for m, method in methods.items():
-            image = method(*arguments(method, window))
-            decibels[m].append(score(image, window, causes, None, hdr=True)["psnr"])
-    mean = {m: np.mean(values) for m, values in decibels.items()}
-    assert mean["extranet"] > mean["occlusion_warp"] + 1
-    assert mean["extranet"] > mean["guided_warp"]
-
-
-@pytest.fixture(scope="module")
-def saved(model, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("weights")
-    preparation = dataclasses.replace(RELEASE, first_guess="guided")
-    config = module.extranet_config(model.config, preparation)
-    return weights.save_weights(folder, "extranet", nnx.to_pure_dict(nnx.state(model)), config=config, note="random")
-
-
-def test_weights_state_their_preparation(model, saved):
-    history, target = make_window()
-    method = jx.load("extranet", weights=saved)
-    expected = extranet(model, preparation=dataclasses.replace(RELEASE, first_guess="guided"))
-    assert np.array_equal(image_of(method, history, target), image_of(expected, history, target))
-    stated = weights.load_weights(saved).config
-    assert stated["network"]["widths"] == [4, 6]
-    assert stated["preparation"] == json.loads(json.dumps(dataclasses.asdict(expected_preparation())))
-
-
-def expected_preparation():
-    return dataclasses.replace(RELEASE, first_guess="guided")
-
-
-def test_default_weights_are_loaded_where_they_are_shipped(saved, monkeypatch):
-    from jaxtrapolate.weights import files
-
-    monkeypatch.setattr(files, "_SHIPPED", saved.parent)
-    assert jx.load("extranet").past == 3
-
-
-def test_orbax_checkpoints_are_loaded(model, tmp_path):
-    import orbax.checkpoint as ocp
-
-    config = module.extranet_config(model.config, OURS)
-    metadata = {"method": "extranet", "config": json.loads(json.dumps(config)), "note": ""}
-    with ocp.CheckpointManager(tmp_path / "work") as manager:
-        items = {"weights": ocp.args.StandardSave(nnx.to_pure_dict(nnx.state(model)))}
-        manager.save(7, args=ocp.args.Composite(metadata=ocp.args.JsonSave(metadata), **items))
-        manager.wait_until_finished()
-    history, target = make_window()
-    image = image_of(jx.load("extranet", weights=tmp_path / "work"), history, target)
-    assert np.array_equal(image, image_of(extranet(model, preparation=OURS), history, target))
-
-
-def test_weights_that_do_not_fit_are_refused(model, saved, tmp_path):
-    given = weights.load_weights(saved)
-    config = dict(given.config)
-
-    def refused(message, tree=given.tree, method="extranet", **changes):
-        path = weights.save_weights(tmp_path, method, tree, config={**config, **changes}, note="")
-        with pytest.raises(ValueError, match=message) as caught:
-            jx.load("extranet", weights=path)
-        assert "\n" not in str(caught.value)
-        assert str(caught.value).startswith(str(path))
-
-    refused("weights of method 'patchex', expected 'extranet'", method="patchex")
-    refused(r"do not fit: decoder/0/layers/0/feature/bias is \[8\], expected \[9\]", network={"widths": [6, 6]})
-    refused("missing merge/feature/bias", tree={k: v for k, v in given.tree.items() if k != "merge"})
-    refused("ExtraNetConfig has no depth", network={"depth": 4})
-    refused("Preparation: by: expected one of", preparation={"by": "colour"})
-    path = tmp_path / "a.pth.tar"
-    path.write_bytes(b"hello")
-    with pytest.raises(ValueError, match="not a PyTorch checkpoint"):
-        jx.load("extranet", weights=path)
-
-
-# The command line
-
-
-@pytest.fixture(scope="module")
-def dump(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("dump")
-    for time in range(9):
-        write_unreal_frame(folder, "Wall", time, make_frame(time), keyframe=make_keyframe(time))
-    return folder
-
-
-def run(capsys, *arguments):
-    code = main([str(a) for a in arguments])
-    out, err = capsys.readouterr()
-    return code, out, err
-
-
-def test_commands_without_weights_say_so(capsys, dump, tmp_path, monkeypatch):
-    monkeypatch.setattr(weights.files, "_SHIPPED", tmp_path)
-    reason = "no default weights come with this version"
-    code, out, _ = run(capsys, "check", dump)
-    assert code == 0
-    (row,) = [line for line in out.splitlines() if "extranet" in line]
-    assert " no " in row
-    assert reason in " ".join(out.replace("│", " ").split())
-    code, _, err = run(capsys, "evaluate", dump, "--methods", "extranet", "--output", tmp_path / "a")
-    assert (code, err.count("\n")) == (2, 1)
-    assert reason in err
-    arguments = ("--output", tmp_path / "b", "--frames", "5", "--pictures", 0)
-    code, out, _ = run(capsys, "evaluate", dump, "--methods", "repeat,extranet", *arguments)
-    assert code == 0
-    assert f"extranet: left out: method 'extranet': {reason}" in out
-    results = json.loads((tmp_path / "b" / "results.json").read_text())
-    assert list(results["methods"]) == ["repeat"]
-    assert reason in results["skipped"]["extranet"]
-    code, _, err = run(capsys, "generate", dump, "--method", "extranet", "--output", tmp_path / "c")
-    assert (code, err.count("\n")) == (2, 1)
-    assert reason in err
-
-
-@pytest.mark.slow
-def test_commands_take_weights(capsys, dump, saved, tmp_path):
-    arguments = ("--methods", "repeat,extranet", "--output", tmp_path / "a", "--frames", "5,7", "--pictures", 0)
-    code, _, _ = run(capsys, "evaluate", dump, *arguments, "--weights", f"extranet={saved}")
-    assert code == 0
-    results = json.loads((tmp_path / "a" / "results.json").read_text())
-    assert set(results["methods"]) == {"repeat", "extranet"}
-    assert set(results["settings"]["weights"]) == {"extranet"}
-    assert "network" in results["methods"]["extranet"]["stages"]
-    folder = tmp_path / "made"
-    code, _, err = run(
-        capsys, "generate", dump, "--method", "extranet", "--weights", f"extranet={saved}", "--output", folder
-    )
-    assert code == 0, err
-    assert list(folder.glob("*.exr"))
-
-
-def test_weights_are_opened_by_name(saved):
-    found, unavailable = open_methods("extranet, repeat", weights=[f"extranet={saved}"])
-    assert list(found) == ["extranet", "repeat"]
-    assert unavailable == {}
-    assert weights.fingerprint(found["extranet"].state) == weights.fingerprint(jx.load("extranet", weights=saved).state)
-
-
-def test_weights_that_cannot_be_used_end_in_one_line(capsys, dump, saved, tmp_path):
-    other = tmp_path / "extranet-00000000.npz"
-    other.write_bytes(saved.read_bytes())
-    for methods, given, message in (
-        ("extranet", "extranet", "expected NAME=FILE"),
-        ("extranet", "extrenat=a.npz", "expected NAME=FILE"),
-        ("extranet", f"extranet={tmp_path / 'none-12345678.npz'}", "does not exist"),
-        ("extranet", f"extranet={other}", "damaged or changed"),
-        ("extranet", f"extranet={tmp_path}", "no Orbax checkpoint"),
-        ("repeat", f"extranet={saved}", "extranet is not among the methods of --methods"),
-        ("repeat", f"repeat={saved}", "method 'repeat' has none"),
-    ):
-        code, _, err = run(
-            capsys, "evaluate", dump, "--methods", methods, "--weights", given, "--output", tmp_path / "a"
-        )
-        assert (code, err.count("\n")) == (2, 1), err
-        assert message in err
-
-
-def test_import_weights(capsys, saved, tmp_path):
-    """Of what `load` takes; the same weights give the same file."""
-    code, out, _ = run(capsys, "import-weights", saved, "--output", tmp_path / "mine.npz")
-    assert code == 0
-    (path,) = tmp_path.glob("mine-*.npz")
-    assert str(path) in out
-    before, found = weights.load_weights(saved), weights.load_weights(path)
-    assert weights.fingerprint(found.tree) == weights.fingerprint(before.tree)
-    assert found.config == before.config
-    assert found.note == f"imported from {saved.name}"
-    for given, message in (
-        ((tmp_path / "none.pth.tar",), "does not exist"),
-        ((saved, "--output", tmp_path / "a.tar"), "ends in .npz"),
-        ((saved, "--output", tmp_path / "none" / "a.npz"), "its folder does not exist"),
-    ):
-        code, _, err = run(capsys, "import-weights", *given)
-        assert (code, err.count("\n")) == (2, 1)
-        assert message in err
-
-
-# The authors' weights
-
-
-@pytest.fixture(scope="module")
-def official(data):
-    return data / "extranet_medieval.pth.tar"
-
-
-@pytest.mark.slow
-def test_the_authors_network_gives_the_authors_answers(official, data):
-    method = jx.load("extranet", weights=official)
-    with np.load(data / "extranet_vectors.npz") as vectors:
-        for k in (0, 1):
-            given = (jnp.asarray(vectors[f"{k}_{name}"]) for name in ("x", "mask", "features", "history"))
-            np.testing.assert_allclose(method.network(*given), vectors[f"{k}_output"], atol=1e-5)
-
-
-@pytest.mark.slow
-def test_imported_weights_are_the_authors(capsys, official, tmp_path):
-    code, _, _ = run(capsys, "import-weights", official, "--output", tmp_path / "medieval.npz")
-    assert code == 0
-    (path,) = tmp_path.glob("medieval-*.npz")
-    assert path.stat().st_size < 1_150_000
-    history, target = make_window()
-    images = [jx.load("extranet", weights=p)(history, target) for p in (official, path)]
-    np.testing.assert_allclose(*images, rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_known_figures_of_a_path_traced_clip(official, data):
-    """The authors' weights, trained on another scene: 28.7 dB, 19.4 in exact disocclusion."""
-    from jaxtrapolate.causes import disoccluded
-    from jaxtrapolate.evaluation import arguments, windows
-    from jaxtrapolate.files import open_sequence
-
-    sequence, method = open_sequence(data / "czest1dm"), jx.load("extranet", weights=official)
-    whole, holes = [], []
-    for window in windows(sequence, [6, 8, 10, 12], past=3):
-        made, truth = (jx.tonemap(jnp.asarray(a)) for a in (method(*arguments(method, window)), window.truth.color))
-        pair = (replace(sequence.keyframe(n), color=None) for n in (window.number, window.number - 1))
-        hidden = jnp.reshape(disoccluded(*pair), (*truth.shape[:2], 1))
-        whole.append(float(jx.psnr(made, truth)))
-        holes.append(float(jx.psnr(made, truth, mask=hidden)))
-    assert 28.7 < np.mean(whole) < 28.9
-    assert 19.4 < np.mean(holes) < 19.8

@@ -1,5 +1,6 @@
 """The training loop: a step by hand, resumption, kills, devices, configurations, the command line."""
 
+import dataclasses
 import json
 import os
 import pathlib
@@ -32,7 +33,7 @@ from jaxtrapolate.training.config import keep_config
 from jaxtrapolate.training.journal import read_metrics
 from jaxtrapolate.training.step import make_step, schedule, transformation
 from jaxtrapolate.training.tasks import round_key
-from jaxtrapolate.weights import load_orbax
+from jaxtrapolate.weights import load_orbax, save_weights
 from jaxtrapolate.weights.tree import named
 
 TESTS = pathlib.Path(__file__).parent
@@ -218,6 +219,45 @@ def test_a_finished_run_only_exports(whole, tmp_path):
     before = (workdir / "metrics.jsonl").read_text()
     assert train_and_evaluate(settings, workdir) == scores
     assert (workdir / "metrics.jsonl").read_text() == before
+
+
+def test_a_run_begins_with_given_weights(whole, tmp_path):
+    """From another run's model, as folder and as file; what is resumed does not look at them again."""
+    _, workdir, _ = whole
+    loaded = load_orbax(workdir / "model")
+    given = {path: np.asarray(value) for path, value in named(loaded.tree).items()}
+    about = {"config": {"norm": False}, "note": ""}
+    file = save_weights(tmp_path, "toy", loaded.tree, config={}, note="")
+    begun = []
+
+    class Watched(ToyTask):
+        def validate(self, model):
+            begun.append(model_arrays(model))
+            return super().validate(model)
+
+    settings = config(steps=2, average=0.5, log_every=1, checkpoint_every=1, validate_every=1)
+    settings = dataclasses.replace(settings, optimizer=Optimizer(learning_rate=1e-12))
+    for number, start in enumerate((workdir / "model", file)):
+        run = dataclasses.replace(settings, start=str(start))
+        train_and_evaluate(run, tmp_path / str(number), task=Watched())
+        for arrays in begun:
+            np.testing.assert_allclose(arrays["map/kernel"], given["map/kernel"], rtol=1e-6)
+            assert np.abs(arrays["norm/scale"] - given["norm/scale"]).max() < 1e-6
+        assert len(begun) == 2
+        begun.clear()
+    file.unlink()
+    train_and_evaluate(run, tmp_path / "1", task=Watched())
+    for start, message in [
+        (tmp_path / "none-12345678.npz", "does not exist"),
+        (save_weights(tmp_path, "toy", loaded.tree, **about), "of another kind: norm was false, is now not there"),
+        (save_weights(tmp_path, "warp", loaded.tree, config={}, note=""), 'method was "warp", is now "toy"'),
+        (save_weights(tmp_path, "toy", {"map": loaded.tree["map"]}, config={}, note="no norm"), "do not fit: missing"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            train_and_evaluate(dataclasses.replace(settings, start=str(start)), tmp_path / "wrong", task=ToyTask())
+        shutil.rmtree(tmp_path / "wrong")
+    with pytest.raises(InputError, match="no default weights"):
+        train_and_evaluate(dataclasses.replace(settings, start="default"), tmp_path / "wrong", task=ToyTask())
 
 
 def test_pools_made_ahead_are_the_same(whole, tmp_path):

@@ -1,6 +1,7 @@
 """`jaxtrapolate train`: train a network as a configuration says."""
 
 import argparse
+import dataclasses
 import sys
 from typing import Any
 
@@ -21,6 +22,11 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("config", metavar="CONFIG", help="a TOML file, or the name of a shipped configuration")
     parser.add_argument("--workdir", required=True, metavar="DIR", help="for checkpoints, metrics, images, the model")
     parser.add_argument(
+        "--start",
+        metavar="FILE",
+        help="weights to begin with: a file, WORKDIR/model, or default for those of the package (fine-tuning)",
+    )
+    parser.add_argument(
         "--distributed",
         action="store_true",
         help="over several hosts, as the cluster's environment says (Slurm, Open MPI, Kubernetes, Cloud TPU)",
@@ -38,6 +44,8 @@ def run(options: argparse.Namespace) -> int:
 
     console = Console(stderr=True)
     config = load_config(options.config)
+    if options.start is not None:
+        config = dataclasses.replace(config, start=options.start)
     folder = output_folder(options.workdir)
     try:
         with steps(console) as report:

@@ -2,12 +2,11 @@
 
 from collections.abc import Callable, Mapping
 from os import PathLike
-from pathlib import Path
 from typing import Any, TypeVar
 
 from flax import nnx
 
-from jaxtrapolate.weights import fit, load_orbax, load_weights
+from jaxtrapolate.weights import fit, read_weights
 
 M = TypeVar("M", bound=nnx.Module)
 
@@ -18,7 +17,7 @@ def load_network(
     """A method's network with the weights in a file, and what the file states that the method is built with.
 
     Args:
-        path: what ends in `.npz` is read by `load_weights`, a folder by `load_orbax`.
+        path: of a file or folder, see `read_weights`.
         method: whose weights these have to be.
         build: gives, for what the file states, the function that makes the network. It is never run, only traced.
 
@@ -26,7 +25,7 @@ def load_network(
         OSError: the file cannot be read.
         ValueError: one line that names the file: damaged, of another method, or with weights that do not fit.
     """
-    weights = load_orbax(path) if Path(path).is_dir() else load_weights(path)
+    weights = read_weights(path)
     if weights.method not in (method, None):
         raise ValueError(f"{path}: weights of method {weights.method!r}, expected {method!r}")
     structure, state = nnx.split(nnx.eval_shape(build(weights.config)))

@@ -81,6 +81,8 @@ class Config:
         options: the task's own dataclass.
         steps: of the optimiser, in all.
         seed: of the initial weights, the examples and the batches.
+        start: a file of weights, or a run's `model` folder, that the network begins with, or "default" for the weights
+            that come with the package; at random where absent. The optimiser begins anew.
         batch: items a step, over all devices.
         pool: examples that are made at a time, a multiple of `batch`.
         steps_per_round: steps between one pool and the next.
@@ -97,6 +99,7 @@ class Config:
     options: Any
     steps: int
     seed: int = 0
+    start: str | None = None
     batch: int = 8
     pool: int = 64
     steps_per_round: int = 64
@@ -261,7 +264,7 @@ def keep_config(config: Config, path: Path, *, write: bool = True) -> None:
     Raises:
         InputError: the file's differs; the fields are named.
     """
-    new = json.loads(json.dumps(dataclasses.asdict(config)))
+    new = dataclasses.asdict(config)
     try:
         old = json.loads(path.read_text()) if path.exists() else None
     except OSError as error:
@@ -269,14 +272,18 @@ def keep_config(config: Config, path: Path, *, write: bool = True) -> None:
     except ValueError as error:
         raise InputError(f"{path}: no JSON ({error}); choose another workdir") from error
     if old is not None:
-        before, after = _flat(old), _flat(new)
-        differ = [k for k in {**before, **after} if before.get(k) != after.get(k)]
-        if differ:
-            changes = "; ".join(f"{k} was {_show(before, k)}, is now {_show(after, k)}" for k in differ)
+        if changes := differences(old, new):
             raise InputError(f"{path.parent}: holds a run of another configuration: {changes}; choose another workdir")
     elif write:
         with atomic_path(path) as temporary:
             temporary.write_text(json.dumps(new, indent=1))
+
+
+def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
+    """What differs between two nested tables that JSON can hold, by the names of their entries; empty if nothing."""
+    before, after = (_flat(json.loads(json.dumps(table))) for table in (old, new))
+    differ = [k for k in {**before, **after} if before.get(k) != after.get(k)]
+    return "; ".join(f"{k} was {_show(before, k)}, is now {_show(after, k)}" for k in differ)
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:

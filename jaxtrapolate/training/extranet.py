@@ -6,7 +6,6 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import nnx
 from jaxtyping import Array, PRNGKeyArray
 
@@ -21,9 +20,8 @@ from jaxtrapolate.radiance import demodulation_divisor, log_decode, tonemap
 from jaxtrapolate.training.augment import crop
 from jaxtrapolate.training.config import check_range
 from jaxtrapolate.training.tasks import Batch, Example
-from jaxtrapolate.training.windows import WindowOptions, Windows
+from jaxtrapolate.training.windows import WindowOptions, Windows, check_crop, validated
 
-_SHOWN = 4  # windows that validation shows
 _BRIGHTEST = 16.0  # in the log domain; above it nothing is told apart
 _DARKEST = 1e-3
 
@@ -64,8 +62,7 @@ class ExtraNetOptions:
             check_range(self, name, least=0)
         check_range(self, "shade_fraction", above=0, most=1)
         check_range(self, "validation", least=1)
-        if any(a > b for a, b in zip(self.crop, self.windows.size, strict=True)):
-            raise ValueError(f"crop: expected at most windows.size = {list(self.windows.size)}, got {list(self.crop)}")
+        check_crop(self.crop, self.windows.size)
 
 
 class ExtraNetTask:
@@ -145,17 +142,7 @@ class ExtraNetTask:
         """dB of whole validation windows, tone mapped: "psnr", in holes "psnr_hole"; "gain" over the first guess."""
         if self._held is None:
             self._held = self._windows.pool(jax.random.key(0), range(self.options.validation), validation=True)
-        rows, images = [], {}
-        for i in range(self.options.validation):
-            one = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], self._held)
-            row, shown = _scored(model, one)
-            rows.append({name: float(value) for name, value in row.items()})
-            if i < _SHOWN:
-                images[f"window{i}"] = np.asarray(shown)
-        scores = {}
-        for name in rows[0]:
-            known = [row[name] for row in rows if np.isfinite(row[name])]
-            scores[name] = float(np.mean(known)) if known else float("nan")
+        scores, images = validated(lambda one: _scored(model, one), self._held)
         return {"gain": scores["psnr"] - scores["guess"], **scores}, images
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import nnx
 from jaxtyping import Array, PRNGKeyArray
 
@@ -20,9 +19,7 @@ from jaxtrapolate.radiance import compress, expand, tonemap
 from jaxtrapolate.training.augment import crop
 from jaxtrapolate.training.config import check_range
 from jaxtrapolate.training.tasks import Batch, Example
-from jaxtrapolate.training.windows import WindowOptions, Windows
-
-_SHOWN = 4  # windows that validation shows
+from jaxtrapolate.training.windows import WindowOptions, Windows, check_crop, validated
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,8 +43,7 @@ class InterpolatorOptions:
     def __post_init__(self) -> None:
         check_range(self, "epsilon", above=0)
         check_range(self, "validation", least=1)
-        if any(a > b for a, b in zip(self.crop, self.windows.size, strict=True)):
-            raise ValueError(f"crop: expected at most windows.size = {list(self.windows.size)}, got {list(self.crop)}")
+        check_crop(self.crop, self.windows.size)
 
 
 class InterpolatorTask:
@@ -106,13 +102,7 @@ class InterpolatorTask:
         """dB of whole validation windows, tone mapped: "psnr"; "blend", of the mean of the two frames."""
         if self._held is None:
             self._held = self._windows.pool(jax.random.key(0), range(self.options.validation), validation=True)
-        rows, images = [], {}
-        for i in range(self.options.validation):
-            row, shown = _scored(model, jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], self._held))
-            rows.append({name: float(value) for name, value in row.items()})
-            if i < _SHOWN:
-                images[f"window{i}"] = np.asarray(shown)
-        return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}, images
+        return validated(lambda one: _scored(model, one), self._held)
 
 
 def _answer(model: Any, batch: Batch) -> Array:

@@ -10,13 +10,15 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxtrapolate.files import InputError
 from jaxtrapolate.files.atomic import os_input_error
 from jaxtrapolate.training import devices
 from jaxtrapolate.training.checkpoints import Checkpoints, save_model
-from jaxtrapolate.training.config import Config, keep_config, make_task
+from jaxtrapolate.training.config import Config, differences, keep_config, make_task
 from jaxtrapolate.training.journal import Journal, read_metrics
-from jaxtrapolate.training.step import State, Step, make_step
+from jaxtrapolate.training.step import State, Step, make_step, started
 from jaxtrapolate.training.tasks import Example, Task, round_key
+from jaxtrapolate.weights import default_weights, read_weights
 
 Report = Callable[[str, int, int], None]
 """How a run tells where it is: a text, steps done, of how many."""
@@ -52,7 +54,7 @@ def train_and_evaluate(
 
     Raises:
         InputError: a workdir of another configuration, or that cannot be written; a batch that cannot be divided among
-            the devices.
+            the devices; weights to start from that cannot be read or do not fit.
         TrainingError: a loss or gradient that is not finite; the message names the step, and the batch is saved.
     """
     devices.check_divisible(config.batch)
@@ -69,6 +71,8 @@ def train_and_evaluate(
         state, start = step.create(), checkpoints.latest() or 0
         if start:
             state = checkpoints.restore(start, state)
+        elif config.start is not None:
+            state = _begun(state, config.start, task)
         journal = Journal(folder, active=first, step=start)
         ahead = jax.default_backend() != "cpu" if ahead is None else ahead
         with _Pools(task, config, ahead=ahead) as pools:
@@ -77,6 +81,22 @@ def train_and_evaluate(
     save_model(folder / "model", step.model(state), about=task.about)
     validated = [line for line in read_metrics(folder) if line["kind"] == "validation"]
     return {name: value for name, value in validated[-1].items() if name not in ("kind", "step")}
+
+
+def _begun(state: State, start: str, task: Task) -> State:
+    """The initial state with the weights of a file, which have to be of the same method and configuration."""
+    method = task.about["method"]
+    try:
+        weights = read_weights(default_weights(method) if start == "default" else start)
+        if weights.method is not None:
+            own = {"method": weights.method, **weights.config}
+            if differ := differences(own, {"method": method, **task.about["config"]}):
+                raise ValueError(f"start: {weights.source} holds weights of another kind: {differ}")
+        return started(state, weights)
+    except OSError as error:
+        raise os_input_error(start, error) from error
+    except ValueError as error:
+        raise InputError(str(error)) from error
 
 
 class _Pools:

@@ -15,6 +15,7 @@ from jaxtrapolate.records import record, replace
 from jaxtrapolate.training import devices
 from jaxtrapolate.training.config import Config, Optimizer
 from jaxtrapolate.training.tasks import Batch, Example, Task, init_key, step_key
+from jaxtrapolate.weights import Weights, fit
 
 
 @record
@@ -83,6 +84,20 @@ def _averaged(decay: float, count: Array, old: Any, new: Any) -> Any:
     """The running average after `count` steps; at first it forgets faster, so that it does not stay at the start."""
     keep = jnp.minimum(decay, (1.0 + count) / (10.0 + count))
     return jax.tree.map(lambda o, n: (o * keep + n * (1 - keep)).astype(o.dtype), old, new)
+
+
+def started(state: State, weights: Weights) -> State:
+    """An initial state that begins with given weights and statistics.
+
+    Raises:
+        ValueError: one line that names the source: weights that do not fit.
+    """
+    both = nnx.merge_state(state.weights, state.statistics)
+    found = fit(nnx.to_pure_dict(both), weights.tree, source=weights.source)
+    nnx.replace_by_pure_dict(both, jax.device_put(found, devices.replicated()))
+    given = nnx.split_state(both, nnx.Param, nnx.BatchStat)
+    average = None if state.average is None else jax.tree.map(jnp.copy, given)  # a step gives up the memory of each
+    return replace(state, weights=given[0], statistics=given[1], average=average)
 
 
 def make_step(task: Task, config: Config) -> Step:

@@ -7,7 +7,7 @@ for each example of a pool and at full frame; batches are cut from what that giv
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import jax
@@ -36,6 +36,8 @@ SEEDS = TRAINING_SEEDS[: -(2**20)]
 
 MOVING = tuple(name for name in scene_names() if name != "still")
 """The scenes in which something moves."""
+
+_SHOWN = 4  # validation windows whose images are kept
 
 Prepare = Callable[[Window, PRNGKeyArray], Example]
 """What a task makes of a window, once: pure and traced; for windows of several sizes cut to one."""
@@ -177,6 +179,34 @@ def _mapped(function: Callable[..., Any], count: int) -> Callable[..., Any]:
         along = PartitionSpec("example")
         return jax.jit(jax.shard_map(over, mesh=mesh, in_specs=along, out_specs=along, check_vma=False))
     return jax.jit(over)
+
+
+def check_crop(crop: Size, size: Size) -> None:
+    """Raise `ValueError` unless crops fit into the windows."""
+    if any(a > b for a, b in zip(crop, size, strict=True)):
+        raise ValueError(f"crop: expected at most windows.size = {list(size)}, got {list(crop)}")
+
+
+def validated(
+    score: Callable[[Example], tuple[Mapping[str, Array], Array]], held: Example
+) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """The scores of validation windows, each the mean of those that are finite, and the images of the first few.
+
+    Args:
+        score: of a batch of one window: scalars by name, and an image.
+        held: the windows, stacked along a leading axis.
+    """
+    rows, images = [], {}
+    for i in range(len(jax.tree.leaves(held)[0])):
+        row, shown = score(jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], held))
+        rows.append({name: float(value) for name, value in row.items()})
+        if i < _SHOWN:
+            images[f"window{i}"] = np.asarray(shown)
+    scores = {}
+    for name in rows[0]:
+        known = [row[name] for row in rows if np.isfinite(row[name])]
+        scores[name] = float(np.mean(known)) if known else float("nan")
+    return scores, images
 
 
 class Windows:

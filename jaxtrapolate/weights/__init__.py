@@ -7,6 +7,7 @@ from jaxtrapolate.weights.files import Weights as Weights
 from jaxtrapolate.weights.files import default_weights as default_weights
 from jaxtrapolate.weights.files import load_orbax as load_orbax
 from jaxtrapolate.weights.files import load_weights as load_weights
+from jaxtrapolate.weights.files import read_weights as read_weights
 from jaxtrapolate.weights.files import save_weights as save_weights
 from jaxtrapolate.weights.pytorch import read_torch as read_torch
 from jaxtrapolate.weights.tree import configured as configured

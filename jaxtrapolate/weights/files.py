@@ -151,6 +151,11 @@ def load_orbax(directory: str | PathLike[str]) -> Weights:
         raise ValueError(f"{directory}: damaged Orbax checkpoint ({reason})") from error
 
 
+def read_weights(path: str | PathLike[str]) -> Weights:
+    """Weights from a folder by `load_orbax`, from anything else by `load_weights`; errors are theirs."""
+    return load_orbax(path) if Path(path).is_dir() else load_weights(path)
+
+
 def default_weights(method: str) -> Path:
     """The file of a method's weights that is part of the package.
 
