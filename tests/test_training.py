@@ -470,6 +470,26 @@ def test_command_with_a_bad_file(capsys, tmp_path, text, message):
     assert not (tmp_path / "run").exists()
 
 
+def test_command_with_changed_settings(capsys, tmp_path):
+    workdir = ("--workdir", str(tmp_path / "run"))
+    file = toml(tmp_path / "run.toml")
+    changes = ["steps=2", "optimizer.clip = 0.5", "options.crop=[4, 4]", f"start={tmp_path}/none-12345678.npz"]
+    given = [word for change in changes for word in ("--set", change)]
+    assert "none-12345678.npz: does not exist" in fails(capsys, "train", file, *workdir, *given)
+    kept = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (kept["steps"], kept["optimizer"]["clip"], kept["options"]["crop"]) == (2, 0.5, [4, 4])
+    assert kept["start"] == f"{tmp_path}/none-12345678.npz"
+    for change, message in [
+        ("sped=1", "sped: no such setting"),
+        ("options.crops=1", "options.crops: no such setting"),
+        ("steps.x=1", "steps.x: steps is no table"),
+        ("steps=many", "steps: expected an integer, got 'many'"),
+        ("steps", "--set: expected KEY=VALUE, got 'steps'"),
+        ("options.crop=[1", "--set: options.crop: "),
+    ]:
+        assert message in fails(capsys, "train", file, *workdir, "--set", change)
+
+
 def test_command_with_bad_arguments(capsys, tmp_path):
     workdir = ("--workdir", tmp_path / "run")
     assert "no-such: no such configuration or TOML file" in fails(capsys, "train", "no-such", *workdir)

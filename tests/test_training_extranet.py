@@ -13,7 +13,7 @@ from synthetic import make_frame
 import jaxtrapolate as jx
 from jaxtrapolate.evaluation import Window, hide
 from jaxtrapolate.methods.extranet import Preparation, extranet
-from jaxtrapolate.networks.extranet import ExtraNetConfig
+from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
 from jaxtrapolate.records import replace
 from jaxtrapolate.training import Config, ExtraNetOptions, ExtraNetTask, Optimizer, load_config, train_and_evaluate
 from jaxtrapolate.training.config import parse_config
@@ -68,6 +68,12 @@ def curve(light):
     return np.sqrt(lit / (1 + lit)) + np.minimum(light, 0) * 0.5 / np.sqrt(1e-3)
 
 
+def answer_of(model, made):
+    """The network's answer to an example, in float64."""
+    given = (made["x"], made["mask"], made["features"], jnp.moveaxis(made["history"], 2, 0))
+    return np.float64(nnx.jit(ExtraNet.__call__)(model, *(array[None] for array in given))[0])
+
+
 @pytest.mark.parametrize("space", ["log", "display"])
 def test_the_loss_is_that_of_the_paper(space):
     """In float64: l1 + hole + the largest tenth, of what is no sky; display: after a tone curve of the image."""
@@ -75,10 +81,8 @@ def test_the_loss_is_that_of_the_paper(space):
     batch = jax.tree.map(lambda leaf: leaf[None], made)
     model = task.init(nnx.Rngs(0))
     model.eval()
-    total, parts = task.loss(model, batch)
-    answer = np.float64(
-        model(made["x"][None], made["mask"][None], made["features"][None], jnp.moveaxis(made["history"], 2, 0)[None])[0]
-    )
+    total, parts = nnx.jit(task.loss)(model, batch)
+    answer = answer_of(model, made)
     truth, divisor, mask = (np.float64(made[name]) for name in ("target", "divisor", "mask"))
     known = np.isfinite(truth)
     if space == "display":
@@ -103,13 +107,11 @@ def test_the_relative_loss_is_what_is_left_of_the_first_guess(space):
     batch = jax.tree.map(lambda leaf: leaf[None], made)
     model = task.init(nnx.Rngs(0))
     model.eval()
-    history = jnp.moveaxis(made["history"], 2, 0)[None]
-    answer = np.float64(model(made["x"][None], made["mask"][None], made["features"][None], history)[0])
-    images = [answer, *(np.float64(a) for a in (made["x"][..., :3], made["target"]))]
+    images = [answer_of(model, made), *(np.float64(a) for a in (made["x"][..., :3], made["target"]))]
     if space == "display":
         images = [curve(np.expm1(light) * np.float64(made["divisor"])) for light in images]
     left, before = (np.nanmean((image - images[2]) ** 2) for image in images[:2])
-    np.testing.assert_allclose(task.loss(model, batch)[0], left / (before + 1e-6), rtol=1e-3)
+    np.testing.assert_allclose(nnx.jit(task.loss)(model, batch)[0], left / (before + 1e-6), rtol=1e-3)
 
 
 def test_crops_by_error():

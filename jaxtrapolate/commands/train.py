@@ -1,8 +1,8 @@
 """`jaxtrapolate train`: train a network as a configuration says."""
 
 import argparse
-import dataclasses
 import sys
+import tomllib
 from typing import Any
 
 from rich.console import Console
@@ -22,9 +22,12 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("config", metavar="CONFIG", help="a TOML file, or the name of a shipped configuration")
     parser.add_argument("--workdir", required=True, metavar="DIR", help="for checkpoints, metrics, images, the model")
     parser.add_argument(
-        "--start",
-        metavar="FILE",
-        help="weights to begin with: a file, WORKDIR/model, or default for those of the package (fine-tuning)",
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="a setting in place of the configuration's, as steps=3000, start=default (begins with the weights that "
+        "come with the package) or options.windows.dumps='[\"FOLDER\"]' (learns from your frames); may be repeated",
     )
     parser.add_argument(
         "--distributed",
@@ -43,9 +46,7 @@ def run(options: argparse.Namespace) -> int:
     from jaxtrapolate.training import TrainingError, load_config, train_and_evaluate
 
     console = Console(stderr=True)
-    config = load_config(options.config)
-    if options.start is not None:
-        config = dataclasses.replace(config, start=options.start)
+    config = load_config(options.config, dict(map(_setting, options.set)))
     folder = output_folder(options.workdir)
     try:
         with steps(console) as report:
@@ -56,6 +57,19 @@ def run(options: argparse.Namespace) -> int:
     text = ", ".join(f"{name} {value:.4g}" for name, value in scores.items() if value is not None)
     console.print(f"{config.steps} steps of {config.task}: {text}; in {folder}", soft_wrap=True, highlight=False)
     return 0
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    """A key and a value as TOML has it; a word without quotes stands for itself."""
+    key, equals, value = (part.strip() for part in text.partition("="))
+    if not (key and equals and value):
+        raise InputError(f"--set: expected KEY=VALUE, got {text!r}")
+    try:
+        return key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError as error:
+        if value[0] in "[{\"'":
+            raise InputError(f"--set: {key}: {error}") from error
+        return key, value
 
 
 def _join(options: argparse.Namespace) -> None:

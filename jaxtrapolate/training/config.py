@@ -217,8 +217,12 @@ def parse_config(table: Mapping[str, Any]) -> Config:
     return parse(Config, {**table, "options": made})
 
 
-def load_config(name: str | os.PathLike[str]) -> Config:
+def load_config(name: str | os.PathLike[str], changes: Mapping[str, Any] | None = None) -> Config:
     """The configuration in a TOML file, or the shipped one of that name (see `config_names`).
+
+    Args:
+        name: of either.
+        changes: settings by their full names, as "options.windows.dumps", in place of what the file says.
 
     Raises:
         InputError: no such file, no TOML, an unknown key, a wrong type or value, in one line that names the key.
@@ -227,7 +231,10 @@ def load_config(name: str | os.PathLike[str]) -> Config:
     shipped = _shipped()
     try:
         content = shipped[text].read_text() if text in shipped else Path(text).read_text(encoding="utf-8")
-        return parse_config(tomllib.loads(content))
+        table = tomllib.loads(content)
+        for key, value in (changes or {}).items():
+            _put(table, key, value)
+        return parse_config(table)
     except OSError as error:
         if not text.endswith(".toml") and not Path(text).exists():
             there = f"the shipped ones are {', '.join(shipped)}" if shipped else "none are shipped"
@@ -235,6 +242,15 @@ def load_config(name: str | os.PathLike[str]) -> Config:
         raise os_input_error(text, error) from error
     except (ValueError, UnicodeDecodeError) as error:  # also what is no TOML
         raise InputError(f"{text}: {error}") from error
+
+
+def _put(table: dict[str, Any], key: str, value: Any) -> None:
+    *path, last = key.split(".")
+    for part in path:
+        table = table.setdefault(part, {})
+        if not isinstance(table, dict):
+            raise ValueError(f"{key}: {part} is no table")
+    table[last] = value
 
 
 def config_names() -> tuple[str, ...]:
