@@ -103,31 +103,47 @@ def test_the_loss_is_that_of_the_paper(space):
 
 @pytest.mark.parametrize("space", ["log", "display"])
 def test_the_relative_loss_is_what_is_left_of_the_first_guess(space):
-    task, made = example(space=space, loss="relative")
+    """Of all, and of holes once more."""
+    task, made = example(space=space, loss="relative", hole_weight=0.5)
     batch = jax.tree.map(lambda leaf: leaf[None], made)
     model = task.init(nnx.Rngs(0))
     model.eval()
     images = [answer_of(model, made), *(np.float64(a) for a in (made["x"][..., :3], made["target"]))]
     if space == "display":
         images = [curve(np.expm1(light) * np.float64(made["divisor"])) for light in images]
-    left, before = (np.nanmean((image - images[2]) ** 2) for image in images[:2])
-    np.testing.assert_allclose(nnx.jit(task.loss)(model, batch)[0], left / (before + 1e-6), rtol=1e-3)
+    errors = [(image - images[2]) ** 2 for image in images[:2]]
+    hole = np.broadcast_to(np.asarray(made["mask"]) < 0.5, errors[0].shape)
+    assert 0 < hole.sum() < hole.size
+    whole, holes = ([np.nanmean(error[where]) for error in errors] for where in (np.ones_like(hole), hole))
+    (left, before), (left_holes, before_holes) = whole, holes
+    expected = {"whole": left / (before + 1e-6), "hole": left_holes / (before_holes + 1e-6)}
+    total, parts = nnx.jit(task.loss)(model, batch)
+    for name, value in expected.items():
+        np.testing.assert_allclose(parts[name], value, rtol=1e-3)
+    np.testing.assert_allclose(total, expected["whole"] + 0.5 * expected["hole"], rtol=1e-3)
 
 
 def test_crops_by_error():
-    """As likely around a pixel as its squared error is large; the weight is no part of the batch."""
-    task, made = example(crops="error", space="display", crop=(4, 4))
+    """As likely around a pixel as its squared error is large, in holes more so; the weight is no part of the batch."""
+    task, made = example(crops="error", space="display", crop=(4, 4), hole_weight=0.0)
     light = (np.float64(made[name]) for name in ("x", "target"))
     guess, truth = (curve(np.expm1(a[..., :3]) * np.float64(made["divisor"])) for a in light)
     error = np.nan_to_num(((guess - truth) ** 2).mean(-1))
     np.testing.assert_allclose(made["weight"][..., 0], error, rtol=1e-2, atol=1e-7)
     keys = jax.random.split(jax.random.key(0), 400)
     assert "weight" not in task.sample(made, keys[0])
-    marked = {"place": jnp.stack(jnp.meshgrid(jnp.arange(48.0), jnp.arange(32.0)), -1), "weight": made["weight"]}
-    corners = np.asarray(jax.vmap(lambda key: task.sample(marked, key)["place"][0, 0])(keys))
-    held = np.array([error[int(y) : int(y) + 4, int(x) : int(x) + 4].sum() for x, y in corners])
+    marked = {"place": jnp.stack(jnp.meshgrid(jnp.arange(48.0), jnp.arange(32.0)), -1)}
+    marked |= {"weight": made["weight"], "mask": made["mask"]}
+
+    def held(by, of):
+        corners = np.asarray(jax.vmap(lambda key: by.sample(marked, key)["place"][0, 0])(keys))
+        return np.mean([of[int(y) : int(y) + 4, int(x) : int(x) + 4].sum() for x, y in corners])
+
     anywhere = np.mean([error[r : r + 4, c : c + 4].sum() for r in range(29) for c in range(45)])
-    assert held.mean() > 1.2 * anywhere
+    assert held(task, error) > 1.2 * anywhere
+    holes = np.where(np.asarray(made["mask"])[..., 0] < 0.5, error, 0)
+    more = ExtraNetTask(dataclasses.replace(task.options, hole_weight=50.0))
+    assert held(more, holes) > 1.2 * held(task, holes)
 
 
 @pytest.mark.slow

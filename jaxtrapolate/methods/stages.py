@@ -90,15 +90,17 @@ def layers(values: Values) -> tuple[Array, ...]:
 def modulate_stage(by: By = "albedo+specular", *, floor: float = 1e-2, sky: bool = True) -> Stage:
     """Multiplies by the target's reflectance, and mixes in the colour that was warped as it is, by "plain_share".
 
-    That colour is the plain warp's outside holes, and in holes the method's own. Options as of `demodulate_stage`.
+    That colour is the method's own; the plain warp's where neither way has erred, so that what stands still is exact.
+    Options as of `demodulate_stage`.
     """
 
     def function(state, values: Values):
         image = modulate(values["warped"][..., :3], demodulated(values["target"].gbuffer, sky), by=by, floor=floor)
         if "plain_share" in values:
-            plain = backward_warp(values["newest"].color, values["motion"])
-            plain = jnp.where(values["holes"], values["warped"][..., 3:], plain)
-            image = image * (1 - values["plain_share"]) + plain * values["plain_share"]
+            share, own = values["plain_share"], values["warped"][..., 3:]
+            exact = backward_warp(values["newest"].color, values["motion"])
+            plain = jnp.where(values["holes"] | (share < 1), own, exact)
+            image = image * (1 - share) + plain * share
         return {"image": image}
 
     return Stage("modulate", function, reads=("history.albedo", "target.albedo"), optional=True)

@@ -24,6 +24,7 @@ from jaxtrapolate.training.windows import WindowOptions, Windows, check_crop, va
 
 _BRIGHTEST = 16.0  # in the log domain; above it nothing is told apart
 _DARKEST = 1e-3
+_LEAST = 1e-12  # the sum of weights that are all 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,10 +38,12 @@ class ExtraNetOptions:
         crop: `(H, W)` of an item, a multiple of the network's.
         space: where errors are measured: "log" of the light, as in the paper; or "display", the image after a tone
             curve, where an error under a dark albedo counts as little as it is seen.
-        loss: "extranet", `extranet_loss`; or "relative", `relative_loss` against the first guess.
-        hole_weight, shade_weight, shade, shade_fraction: of `extranet_loss`.
+        loss: "extranet", `extranet_loss`; or "relative", `relative_loss` against the first guess, once of all and,
+            times `hole_weight`, once of holes alone, whose errors may be small beside the largest.
+        hole_weight: of holes in either loss, and in "error" crops.
+        shade_weight, shade, shade_fraction: of `extranet_loss`.
         crops: "even", anywhere; or "error", around pixels drawn by the first guess's squared error, so that the mean of
-            the relative loss over crops is about that over frames.
+            the relative loss over crops is about that over frames; with `hole_weight` times the chance in holes alone.
         validation: windows that validation looks at.
     """
 
@@ -124,6 +127,10 @@ class ExtraNetTask:
     def sample(self, example: Example, key: PRNGKeyArray) -> Batch:
         """A random crop."""
         weight = example.pop("weight") if "weight" in (example := dict(example)) else None
+        if weight is not None:
+            holes = jnp.where(example["mask"] < 0.5, weight, 0)
+            weight, holes = (error / jnp.maximum(jnp.sum(error), _LEAST) for error in (weight, holes))
+            weight += self.options.hole_weight * holes
         return crop(example, key, size=self.options.crop, weight=weight)
 
     def loss(self, model: nnx.Module, batch: Batch) -> tuple[Array, Mapping[str, Array]]:
@@ -132,7 +139,9 @@ class ExtraNetTask:
         made, truth = self._measured(_answer(model, batch), batch)
         if o.loss == "relative":
             guess, _ = self._measured(batch["x"][..., :3], batch)
-            return jnp.mean(jax.vmap(relative_loss)(made, truth, guess)), {}
+            holes = jnp.where(batch["mask"] < 0.5, truth, jnp.nan)  # NaN does not count
+            whole, hole = (jnp.mean(jax.vmap(relative_loss)(made, target, guess)) for target in (truth, holes))
+            return whole + o.hole_weight * hole, {"whole": whole, "hole": hole}
         how: dict[str, Any] = {"hole_weight": o.hole_weight, "shade_weight": o.shade_weight}
         how |= {"shade": o.shade, "fraction": o.shade_fraction}
         total, parts = jax.vmap(lambda *a: extranet_loss(*a, **how))(made, truth, batch["mask"].astype(jnp.float32))
