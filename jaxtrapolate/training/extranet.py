@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -25,6 +26,7 @@ from jaxtrapolate.training.windows import WindowOptions, Windows, check_crop, va
 _BRIGHTEST = 16.0  # in the log domain; above it nothing is told apart
 _DARKEST = 1e-3
 _LEAST = 1e-12  # the sum of weights that are all 0
+_LEAST_ERROR, _LEAST_HOLE_ERROR = 1e-6, 1e-4  # squared errors: few hole pixels that are all but right teach nothing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +142,10 @@ class ExtraNetTask:
         if o.loss == "relative":
             guess, _ = self._measured(batch["x"][..., :3], batch)
             holes = jnp.where(batch["mask"] < 0.5, truth, jnp.nan)  # NaN does not count
-            whole, hole = (jnp.mean(jax.vmap(relative_loss)(made, target, guess)) for target in (truth, holes))
+            whole, hole = (
+                jnp.mean(jax.vmap(partial(relative_loss, epsilon=least))(made, target, guess))
+                for target, least in ((truth, _LEAST_ERROR), (holes, _LEAST_HOLE_ERROR))
+            )
             return whole + o.hole_weight * hole, {"whole": whole, "hole": hole}
         how: dict[str, Any] = {"hole_weight": o.hole_weight, "shade_weight": o.shade_weight}
         how |= {"shade": o.shade, "fraction": o.shade_fraction}
