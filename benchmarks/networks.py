@@ -240,8 +240,7 @@ def main(argv: list[str] | None = None) -> int:
         sizes = {name: size_of(name) for name in options.sizes.split(",")}
     except ValueError as error:
         parser.error(str(error))
-    # pinned to one core XLA has one thread by itself; its convolutions "for one thread" are slower
-    confine(options.threads, options.allocator, flags=())
+    confine(options.threads, options.allocator)
     if options.threads == "1" and present("torch"):
         importlib.import_module("torch").set_num_threads(1)
     results: dict[str, Any] = {

@@ -12,7 +12,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -334,15 +334,12 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def confine(threads: str, allocator: str, *, flags: Sequence[str] = _ONE_THREAD) -> None:
-    """Starts this program anew on one core, or with other allocator settings; both only count from the start on.
-
-    flags: of XLA, for one thread.
-    """
+def confine(threads: str, allocator: str) -> None:
+    """Starts this program anew on one core, or with other allocator settings; both only count from the start on."""
     environment = dict(os.environ)
     if threads == "1":
         words = environment.get("XLA_FLAGS", "").split()
-        environment["XLA_FLAGS"] = " ".join([*words, *(flag for flag in flags if flag not in words)])
+        environment["XLA_FLAGS"] = " ".join([*words, *(flag for flag in _ONE_THREAD if flag not in words)])
         environment |= dict.fromkeys(_THREAD_VARIABLES, "1")
     if allocator == "keep":
         environment["GLIBC_TUNABLES"] = _KEEP
