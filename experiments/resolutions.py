@@ -127,7 +127,8 @@ def _print(content: dict[str, Any]) -> None:
                 table.add_column(column)
             rows: dict[str, list[str]] = {}
             for found in sizes.values():
-                by_name = found if kind == "errors" else found["whole"] | found["extranet's stages"] | found["networks"]
+                stages = {f"extranet: {name}": ms for name, ms in found.get("extranet's stages", {}).items()}
+                by_name = found if kind == "errors" else found["whole"] | stages | found["networks"]
                 for name, entry in by_name.items():
                     rows.setdefault(name, []).append(f"{entry[value] if kind == 'errors' else entry:.2f}")
             for name, cells in rows.items():

@@ -139,7 +139,7 @@ def test_the_pure_function_under_grad_and_vmap():
     method = jx.load("guided_warp")
     windows = [window(t) for t in (4, 5)]
     batch = jax.tree.map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *[w[:2] for w in windows])
-    images = jax.vmap(lambda h, t: method.function((), (), h, t)[1])(*batch)
+    images = jax.jit(jax.vmap(lambda h, t: method.function((), (), h, t)[1]))(*batch)
     single = np.stack([method(h, t) for h, t, _ in windows])
     np.testing.assert_allclose(images, single, atol=2e-5)
 
@@ -148,7 +148,7 @@ def test_the_pure_function_under_grad_and_vmap():
     def loss(motion):
         return jnp.mean(jnp.square(method.function((), (), history, replace(target, motion=motion))[1] - truth))
 
-    gradient = jax.grad(loss)(jnp.asarray(target.motion))
+    gradient = jax.jit(jax.grad(loss))(jnp.asarray(target.motion))
     assert np.isfinite(gradient).all()
     assert np.abs(gradient).max() > 0
 
