@@ -44,9 +44,9 @@ def demo_strip(folder: Path) -> Image.Image:
         name: next(f["psnr"] for f in m["frames"] if f["number"] == shown["number"])
         for name, m in results["methods"].items()
     }
-    for name in ("warp", "guided_warp"):
+    for name in ("warp", "extranet"):
         crop.append((f"{name}: {scores[name]:.1f} dB", shown["methods"][name]["image"]))
-    for name in ("warp", "guided_warp"):
+    for name in ("warp", "extranet"):
         crop.append((f"error of {name}", shown["methods"][name]["error"]))
     order = [0, 2, 4, 1, 3, 5]
     tiles = [labelled(Image.open(folder / crop[i][1]).convert("RGB"), crop[i][0]) for i in order]
