@@ -255,9 +255,10 @@ def _write(options: argparse.Namespace) -> None:
             runs[name] = [json.loads(path.read_text()) for path in paths]
     rows = {name: summary(of) for name, of in runs.items()}
     unseen = {name: summary(of, UNSEEN) for name, of in runs.items()}
-    frames = {name: [[round(score["psnr"], 3) for score in scores] for scores in of] for name, of in runs.items()}
+    each = {name: [round(mean_over_frames(scores)["psnr"], 3) for scores in of] for name, of in runs.items()}
     given = {k: getattr(options, k) for k in ("steps", "windows", "frame")}
-    content = {"machine": machine(), **given, "all scenes": rows, f"on {' and '.join(UNSEEN)}": unseen, "dB": frames}
+    scores = {"all scenes": rows, f"on {' and '.join(UNSEEN)}": unseen, "dB by seed": each}
+    content = {"machine": machine(), **given, **scores}
     with atomic_path(options.output) as temporary:
         temporary.write_text(json.dumps(content, indent=1))
     table = Table(title="dB, mean of the test windows, +- spread over seeds")

@@ -12,10 +12,20 @@ from synthetic import make_frame
 
 import jaxtrapolate as jx
 from jaxtrapolate.evaluation import Window, hide
+from jaxtrapolate.files import InputError, write_unreal_frame
 from jaxtrapolate.methods.extranet import Preparation, extranet
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
 from jaxtrapolate.records import replace
-from jaxtrapolate.training import Config, ExtraNetOptions, ExtraNetTask, Optimizer, load_config, train_and_evaluate
+from jaxtrapolate.training import (
+    Config,
+    ExtraNetOptions,
+    ExtraNetTask,
+    InterpolatorOptions,
+    InterpolatorTask,
+    Optimizer,
+    load_config,
+    train_and_evaluate,
+)
 from jaxtrapolate.training.config import parse_config
 from jaxtrapolate.training.windows import WindowOptions
 
@@ -180,6 +190,19 @@ def test_shipped_configurations():
         assert isinstance(config.options, ExtraNetOptions)
         multiple = config.options.network.multiple
         assert all(side % multiple == 0 for side in config.options.crop)
+
+
+@pytest.mark.parametrize(
+    ("task", "options"), [(ExtraNetTask, ExtraNetOptions), (InterpolatorTask, InterpolatorOptions)]
+)
+def test_dumps_of_another_size_are_refused(tmp_path, task, options):
+    """Before anything is rendered, with what is to be set."""
+    for time in range(8):
+        write_unreal_frame(tmp_path, "Wall", time, make_frame(time, (32, 40)))
+    windows = WindowOptions(size=(64, 64), dumps=(str(tmp_path),))
+    with pytest.raises(InputError, match=r"its frames are \[32, 40\], options.windows.size is \[64, 64\]"):
+        task(options(windows=windows, crop=(32, 32)))
+    assert task(options(windows=dataclasses.replace(windows, size=(32, 40)), crop=(32, 32))).about["method"]
 
 
 def test_errors():

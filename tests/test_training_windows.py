@@ -21,7 +21,7 @@ from jaxtrapolate.training import windows as module
 from jaxtrapolate.training.augment import crop
 from jaxtrapolate.training.config import parse
 from jaxtrapolate.training.journal import read_metrics
-from jaxtrapolate.training.windows import SEEDS, VALIDATION_SEEDS, WindowOptions, Windows, scene_window
+from jaxtrapolate.training.windows import SEEDS, VALIDATION_SEEDS, WindowOptions, Windows, _parted, scene_window
 
 SIZE = (22, 34)
 
@@ -159,16 +159,25 @@ def dump(tmp_path_factory):
 
 @pytest.mark.parametrize("together", [1, 2])
 def test_windows_of_dumps(dump, together):
-    """Three of eight frames have five before them: each window is as evaluation has it."""
+    """Three of eight frames have five before them: each window is as evaluation has it; the last is for validation."""
     options = WindowOptions(dumps=(str(dump),), dumps_share=1.0, flip=(0, 0), together=together)
-    made = Windows(options, everything, past=3).pool(jax.random.key(0), range(8))["window"]
-    seen = set()
-    for i in range(8):
-        window = jax.tree.map(lambda a, i=i: a[i], made)
-        (expected,) = windows_of(open_sequence(dump), [int(window.number)], past=3)
-        assert_same(window, expected, skip=(), rtol=0, atol=0)
-        seen.add(int(window.number))
-    assert seen == {5, 6, 7}
+    windows, seen = Windows(options, everything, past=3), {True: set(), False: set()}
+    for validation, numbers in seen.items():
+        made = windows.pool(jax.random.key(0), range(8), validation=validation)["window"]
+        for i in range(8):
+            window = jax.tree.map(lambda a, i=i: a[i], made)
+            (expected,) = windows_of(open_sequence(dump), [int(window.number)], past=3)
+            assert_same(window, expected, skip=(), rtol=0, atol=0)
+            numbers.add(int(window.number))
+    assert seen == {False: {5, 6}, True: {7}}
+
+
+@pytest.mark.parametrize(("count", "training"), [(1, 1), (2, 1), (9, 8), (10, 9), (11, 9), (40, 36)])
+def test_the_last_tenth_of_a_dump_is_held_back(count, training):
+    numbers = list(range(count))
+    seen, held = _parted(numbers)
+    assert seen == numbers[:training]
+    assert held == (numbers[training:] or numbers)
 
 
 def test_dumps_that_cannot_be(dump, tmp_path):

@@ -61,6 +61,7 @@ class InterpolatorTask:
         self.options = options
         self._stages = interpolator(Interpolator(options.network, rngs=nnx.Rngs(0)))
         self._windows = Windows(options.windows, self._prepare, past=1, future=1)
+        self._windows.check_sizes()
         self._held: Example | None = None
         scenes = ", ".join(options.windows.scenes)
         config = interpolator_config(options.network)

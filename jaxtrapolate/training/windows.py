@@ -58,7 +58,8 @@ class WindowOptions:
         flip: how likely a window is mirrored left to right, and top to bottom.
         bare: the share of windows that are shown with colour, motion, depth and stencil alone, as many engines write.
         together: how many windows in a row are of one scene; accelerators render these at once.
-        dumps: folders of frames with all buffers, see `jaxtrapolate.files.open_sequence`.
+        dumps: folders of frames with all buffers, see `jaxtrapolate.files.open_sequence`. The last tenth of each one's
+            windows is for validation.
         dumps_share: of the windows that are of dumps, where there are any; each window of all dumps is equally likely.
     """
 
@@ -209,6 +210,12 @@ def validated(
     return scores, images
 
 
+def _parted(numbers: list[int]) -> tuple[list[int], list[int]]:
+    """Numbers for training and for validation, the last tenth; a single one is for both."""
+    held = -(-len(numbers) // 10) if len(numbers) > 1 else 0
+    return numbers[: len(numbers) - held], numbers[len(numbers) - held :] or numbers
+
+
 class Windows:
     """Pools of prepared windows, each determined by a key and its number.
 
@@ -224,10 +231,18 @@ class Windows:
 
     def __init__(self, options: WindowOptions, prepare: Prepare, *, past: int, future: int = 0) -> None:
         self.options, self._past, self._future = options, past, future
-        self._dumps = [(s, self._numbers(s)) for s in map(open_sequence, options.dumps)]
+        self._dumps = [(s, *_parted(self._numbers(s))) for s in map(open_sequence, options.dumps)]
         draw = functools.partial(scene_window, size=options.size, past=past, future=future, motion=options.motion)
         self._render = _mapped(draw, options.together)
         self._prepare = _mapped(lambda w, h, v, key: prepare(flip(w, horizontal=h, vertical=v), key), options.together)
+
+    def check_sizes(self) -> None:
+        """For a task that keeps whole frames: raise `InputError` where those of a dump are not of `options.size`."""
+        expected = self.options.size
+        for sequence, _, _ in self._dumps:
+            if sequence.size != tuple(expected):
+                text = f"its frames are {list(sequence.size)}, options.windows.size is {list(expected)}"
+                raise InputError(f"{sequence.name}: {text}; all windows of a run must have one size")
 
     def _numbers(self, sequence: Sequence) -> list[int]:
         """The frames of a sequence that have all that a window needs around them."""
@@ -242,7 +257,7 @@ class Windows:
     def pool(self, key: PRNGKeyArray, numbers: range, *, validation: bool = False) -> Example:
         """The prepared windows `numbers` of the pool that a key stands for, stacked along a leading axis.
 
-        validation: of scenes by `VALIDATION_SEEDS` instead of `SEEDS`.
+        validation: of scenes by `VALIDATION_SEEDS` instead of `SEEDS`, of dumps' last tenth.
 
         Raises:
             ValueError: `prepare` gives arrays of several shapes.
@@ -264,7 +279,7 @@ class Windows:
         flips = rng.random((2, count)) < np.array(options.flip)[:, None]
         keys = jax.random.split(jax.random.fold_in(key, number), count)
         if self._dumps and rng.random() < options.dumps_share:
-            name, windows = self._read(rng, count)
+            name, windows = self._read(rng, count, validation)
         else:
             name, windows = self._draw(rng, count, VALIDATION_SEEDS if validation else SEEDS)
         if options.bare and rng.random() < options.bare:
@@ -282,9 +297,10 @@ class Windows:
         times, steps = (rng.uniform(*bounds, count).astype(np.float32) for bounds in (options.time, options.step))
         return name, self._render(worlds, times, steps)
 
-    def _read(self, rng: np.random.Generator, count: int) -> tuple[str, Window]:
-        shares = np.array([len(numbers) for _, numbers in self._dumps])
-        sequence, numbers = self._dumps[rng.choice(len(self._dumps), p=shares / shares.sum())]
+    def _read(self, rng: np.random.Generator, count: int, validation: bool) -> tuple[str, Window]:
+        dumps = [(sequence, held if validation else seen) for sequence, seen, held in self._dumps]
+        shares = np.array([len(numbers) for _, numbers in dumps])
+        sequence, numbers = dumps[rng.choice(len(dumps), p=shares / shares.sum())]
         chosen = [numbers[i] for i in rng.integers(0, len(numbers), count)]
         read = [next(windows_of(sequence, [n], past=self._past, future=self._future)) for n in chosen]
         return sequence.name, jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *read)
