@@ -31,8 +31,6 @@ from jaxtrapolate.timing import Timing, compiled, machine, measure, measure_pair
 
 _ONE_THREAD = ("--xla_cpu_multi_thread_eigen=false", "intra_op_parallelism_threads=1")
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
-# memory that was freed stays with the process, in huge pages where the system has them
-_KEEP = "glibc.malloc.hugetlb=1:glibc.malloc.mmap_threshold=1073741824:glibc.malloc.trim_threshold=4294967296"
 
 
 @dataclass(frozen=True)
@@ -335,20 +333,20 @@ def table(results: dict[str, Any]) -> str:
 
 
 def confine(threads: str, allocator: str) -> None:
-    """Starts this program anew on one core, or with other allocator settings; both only count from the start on."""
+    """Starts this program anew on one core, which only counts from the start on; "keep" keeps freed memory."""
     environment = dict(os.environ)
     if threads == "1":
         words = environment.get("XLA_FLAGS", "").split()
         environment["XLA_FLAGS"] = " ".join([*words, *(flag for flag in _ONE_THREAD if flag not in words)])
         environment |= dict.fromkeys(_THREAD_VARIABLES, "1")
-    if allocator == "keep":
-        environment["GLIBC_TUNABLES"] = _KEEP
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     pin = threads == "1" and len(cores) > 1
     if pin:
         os.sched_setaffinity(0, cores[-1:])
     if pin or environment != dict(os.environ):
         os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], environment)
+    if allocator == "keep" and not jt.keep_memory():
+        sys.exit("--allocator keep: not on this system, or with allocator settings in the environment")
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
@@ -356,7 +354,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--sizes", default="360p,720p,1080p", help="names or WIDTHxHEIGHT, comma-separated")
     parser.add_argument("--only", default="", help="only operations whose name contains one of these, comma-separated")
     parser.add_argument("--threads", choices=("1", "all"), default="1", help="1: one core and one thread for everyone")
-    help = "keep: glibc keeps freed memory, and uses huge pages, for everyone"
+    help = "keep: freed memory is kept, for everyone (jaxtrapolate.keep_memory)"
     parser.add_argument("--allocator", choices=("default", "keep"), default="default", help=help)
     parser.add_argument("--repeats", type=int, default=15, help="rounds that count")
     parser.add_argument("--seed", type=int, default=0, help="of the inputs")

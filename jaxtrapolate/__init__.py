@@ -18,6 +18,7 @@ from jaxtrapolate.gather import in_frame as in_frame
 from jaxtrapolate.guided import guided_warp as guided_warp
 from jaxtrapolate.holes import HoleMasks as HoleMasks
 from jaxtrapolate.holes import hole_masks as hole_masks
+from jaxtrapolate.memory import keep_memory as keep_memory
 from jaxtrapolate.methods import Method as Method
 from jaxtrapolate.methods import Stage as Stage
 from jaxtrapolate.methods import load as load

@@ -16,6 +16,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxtrapolate.memory import memory_kept
+
 _SETTINGS = ("XLA_", "JAX_", "OMP_", "MKL_", "OPENBLAS_", "NUMBA_", "MALLOC_", "GLIBC_TUNABLES", "LD_PRELOAD")
 _FOLDERS = re.compile(r"[^\s=:]*/")
 
@@ -180,5 +182,6 @@ def machine() -> dict[str, Any]:
         "backend_version": device.client.platform_version.splitlines()[0] if on_gpu else None,
         "gpu": device.device_kind if on_gpu else None,
         "gpu_driver": _driver() if on_gpu else None,
+        "memory_kept": memory_kept(),
         "settings": {k: _FOLDERS.sub("", v) for k, v in sorted(os.environ.items()) if k.startswith(_SETTINGS)},
     }

@@ -1,6 +1,9 @@
 """What all tests share: annotations checked at run time, strict promotion, float64, and the folder of large data."""
 
+import atexit
 import os
+import shutil
+import tempfile
 
 import jaxtyping
 import pytest
@@ -14,6 +17,12 @@ def check_annotations(function):
 
     return function if function.__name__ == "__init__" else beartype(function)
 
+
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    # What one process has compiled the others need not, nor commands that tests call: workers inherit the variables.
+    _compiled = tempfile.mkdtemp(prefix="jaxtrapolate-tests-")
+    atexit.register(shutil.rmtree, _compiled, ignore_errors=True)
+    os.environ |= {"JAX_COMPILATION_CACHE_DIR": _compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3"}
 
 if CHECKED:
     jaxtyping.install_import_hook("jaxtrapolate", "conftest.check_annotations")

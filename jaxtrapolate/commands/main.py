@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from jaxtrapolate import __version__
 from jaxtrapolate.commands import check, demo, evaluate, generate, import_weights, render, scenes, train
 from jaxtrapolate.files import InputError
+from jaxtrapolate.memory import keep_memory
 
 
 def parser() -> argparse.ArgumentParser:
@@ -25,6 +26,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; 0, or 2 after one line on stderr about input that cannot be used."""
     options = parser().parse_args(arguments)
+    keep_memory()
     try:
         return options.run(options) or 0
     except InputError as error:

@@ -15,11 +15,10 @@ from jaxtrapolate.bidirectional import interpolate_bidirectional
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.flows import complete_flows
 from jaxtrapolate.gather import backward_warp, in_frame, pixel_grid, sample
-from jaxtrapolate.guided import guided_warp
 from jaxtrapolate.methods.between import BETWEEN, PAIR, depth_of
 from jaxtrapolate.methods.method import Method, Stage, Values, rendered, upcoming
 from jaxtrapolate.methods.stages import SKY, chain, find_holes
-from jaxtrapolate.methods.warping import guides
+from jaxtrapolate.methods.warping import fetch_guided
 from jaxtrapolate.motion import camera_motion
 from jaxtrapolate.radiance import By, compress, demodulate, expand, modulate
 from jaxtrapolate.records import Frame, Keyframe, replace
@@ -155,8 +154,7 @@ def guided_fetch_stage(by: By) -> Stage:
         motions = (values["to_previous"], values["to_next"])
         for name, motion, seen in zip(("previous", "next"), motions, values["seen"], strict=True):
             frame = values[name]
-            pair = guides(values["target"].gbuffer, frame.gbuffer)
-            layers = guided_warp(_layers(frame, by_), motion, *pair)
+            layers = fetch_guided(_layers(frame, by_), motion, ~seen, values["target"].gbuffer, frame.gbuffer)
             color = backward_warp(check_present("color", frame.color, needed_by="guided fetch"), motion)
             color = jnp.where(seen, color, layers[..., -3:])  # so that what stands still stays as it is
             fetched.append(jnp.concatenate([layers[..., :-3], color], -1))

@@ -29,7 +29,7 @@ from jaxtrapolate.methods.stages import (
     modulate_stage,
     reproject_stage,
 )
-from jaxtrapolate.methods.warping import GUIDED
+from jaxtrapolate.methods.warping import guided_stage
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig, extranet_from_torch
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.networks.stored import load_network
@@ -209,7 +209,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
     if config.features not in (0, 6) or not 1 <= config.warps <= 2:
         raise ValueError(f"model: expected 6 features or none and 1 or 2 warped images, got {config}")
     function, state = inference(model)
-    guided = (dataclasses.replace(GUIDED, optional=True),) if preparation.first_guess == "guided" else ()
+    guided = (dataclasses.replace(guided_stage(), optional=True),) if preparation.first_guess == "guided" else ()
 
     def warp(state, values: Values):
         pairs = zip(layers(values), values["motions"], strict=True)

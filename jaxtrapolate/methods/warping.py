@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from jaxtrapolate.gather import backward_warp
-from jaxtrapolate.guided import guided_warp
+from jaxtrapolate.guided import far_motion, guided_warp
 from jaxtrapolate.methods.hindsight import hindsight_stage
 from jaxtrapolate.methods.method import Method, Stage, Values, rendered
 from jaxtrapolate.methods.stages import (
@@ -58,6 +58,7 @@ def occlusion_warp() -> Method:
 
 
 _GUIDES = ("albedo", "normal")
+ROWS = 240  # of frames that kernels of 10 pixels suit; see experiments/guided_reach.py
 
 
 def guides(target, source):
@@ -66,21 +67,39 @@ def guides(target, source):
     return tuple(jnp.concatenate([getattr(g, n) for n in names], -1) for g in (target, source))
 
 
-def _guided(state, values: Values):
-    target_guide, source_guide = guides(values["target"].gbuffer, values["newest"].gbuffer)
-    warped = guided_warp(layers(values)[0], values["motion"], target_guide, source_guide)
-    return {"warped": warped, "image": warped[..., :3]}
+def fetch_guided(image, motion, holes, target, source, *, rows: int | None = ROWS):
+    """The image by the guided warp along the motion; in holes as far off as in a frame of about `rows` rows.
+
+    From twice that many rows on, holes are first led to a like surface by a coarse search (`far_motion`); `None` leaves
+    that out.
+    """
+    target_guide, source_guide = guides(target, source)
+    step = motion.shape[0] // (rows or motion.shape[0])
+    if step > 1:
+        motion = far_motion(motion, target_guide, source_guide, holes, step=step)
+    return guided_warp(image, motion, target_guide, source_guide)
 
 
-GUIDED = Stage(
-    "guided warp",
-    _guided,
-    reads=tuple("|".join(f"{role}.{name}" for name in (*_GUIDES, "stencil")) for role in ("target", "history")),
-)
-"""Fetches the newest layer from the most similar pixels around where the motion leads."""
+def guided_stage(*, rows: int | None = ROWS) -> Stage:
+    """Fetches the newest layer from the most similar pixels around where the motion leads; see `fetch_guided`."""
+
+    def function(state, values: Values):
+        frames = values["target"].gbuffer, values["newest"].gbuffer
+        warped = fetch_guided(layers(values)[0], values["motion"], values["holes"], *frames, rows=rows)
+        return {"warped": warped, "image": warped[..., :3]}
+
+    reads = tuple("|".join(f"{role}.{name}" for name in (*_GUIDES, "stencil")) for role in ("target", "history"))
+    return Stage("guided warp", function, reads=reads)
 
 
-def guided() -> Method:
-    """The demodulated frame fetched from the most similar pixels around where the motion leads (ExtraSS)."""
-    stages = (REPROJECT, HOLES, hindsight_stage(), demodulate_stage(), GUIDED, modulate_stage(), SKY)
+def guided(*, rows: int | None = ROWS) -> Method:
+    """The demodulated frame fetched from the most similar pixels around where the motion leads (ExtraSS).
+
+    Args:
+        rows: of frames that the kernels suit; in larger ones holes are led further off. `None` = by the kernels alone.
+
+    References:
+        Wu et al. 2023 (ExtraSS), section 4.2. Departure: `far_motion` before it, in frames of 480 rows or more.
+    """
+    stages = (REPROJECT, HOLES, hindsight_stage(), demodulate_stage(), guided_stage(rows=rows), modulate_stage(), SKY)
     return Method("guided_warp", stages, past=2)

@@ -43,6 +43,7 @@ class ExtraNetOptions:
         loss: "extranet", `extranet_loss`; or "relative", `relative_loss` against the first guess, once of all and,
             times `hole_weight`, once of holes alone, whose errors may be small beside the largest.
         hole_weight: of holes in either loss, and in "error" crops.
+        hole_margin: pixels around the masks' holes that count as holes there too: the masks miss their rims.
         shade_weight, shade, shade_fraction: of `extranet_loss`.
         crops: "even", anywhere; or "error", around pixels drawn by the first guess's squared error, so that the mean of
             the relative loss over crops is about that over frames; with `hole_weight` times the chance in holes alone.
@@ -56,6 +57,7 @@ class ExtraNetOptions:
     space: Literal["log", "display"] = "log"
     loss: Literal["extranet", "relative"] = "extranet"
     hole_weight: float = 1.0
+    hole_margin: int = 0
     shade_weight: float = 1.0
     shade: Literal["release", "paper"] = "release"
     shade_fraction: float = 0.1
@@ -63,7 +65,7 @@ class ExtraNetOptions:
     validation: int = 36
 
     def __post_init__(self) -> None:
-        for name in ("hole_weight", "shade_weight"):
+        for name in ("hole_weight", "hole_margin", "shade_weight"):
             check_range(self, name, least=0)
         check_range(self, "shade_fraction", above=0, most=1)
         check_range(self, "validation", least=1)
@@ -131,7 +133,7 @@ class ExtraNetTask:
         """A random crop."""
         weight = example.pop("weight") if "weight" in (example := dict(example)) else None
         if weight is not None:
-            holes = jnp.where(example["mask"] < 0.5, weight, 0)
+            holes = jnp.where(_valid(example["mask"], self.options.hole_margin) < 0.5, weight, 0)
             weight, holes = (error / jnp.maximum(jnp.sum(error), _LEAST) for error in (weight, holes))
             weight += self.options.hole_weight * holes
         return crop(example, key, size=self.options.crop, weight=weight)
@@ -140,9 +142,10 @@ class ExtraNetTask:
         """The loss in the space that the options say, its mean over the batch."""
         o = self.options
         made, truth = self._measured(_answer(model, batch), batch)
+        valid = _valid(batch["mask"], o.hole_margin)
         if o.loss == "relative":
             guess, _ = self._measured(batch["x"][..., :3], batch)
-            holes = jnp.where(batch["mask"] < 0.5, truth, jnp.nan)  # NaN does not count
+            holes = jnp.where(valid < 0.5, truth, jnp.nan)  # NaN does not count
             whole, hole = (
                 jnp.mean(jax.vmap(partial(relative_loss, epsilon=least))(made, target, guess))
                 for target, least in ((truth, _LEAST_ERROR), (holes, _LEAST_HOLE_ERROR))
@@ -150,7 +153,7 @@ class ExtraNetTask:
             return whole + o.hole_weight * hole, {"whole": whole, "hole": hole}
         how: dict[str, Any] = {"hole_weight": o.hole_weight, "shade_weight": o.shade_weight}
         how |= {"shade": o.shade, "fraction": o.shade_fraction}
-        total, parts = jax.vmap(lambda *a: extranet_loss(*a, **how))(made, truth, batch["mask"].astype(jnp.float32))
+        total, parts = jax.vmap(lambda *a: extranet_loss(*a, **how))(made, truth, valid.astype(jnp.float32))
         return jnp.mean(total), {name: jnp.mean(part) for name, part in parts.items()}
 
     def validate(self, model: nnx.Module) -> tuple[Mapping[str, float], Mapping[str, Any]]:
@@ -159,6 +162,12 @@ class ExtraNetTask:
             self._held = self._windows.pool(jax.random.key(0), range(self.options.validation), validation=True)
         scores, images = validated(lambda one: _scored(model, one), self._held)
         return {"gain": scores["psnr"] - scores["guess"], **scores}, images
+
+
+def _valid(mask: Array, margin: int) -> Array:
+    """A mask `[..., H, W, 1]`, 0 in holes, with the holes wider by a margin."""
+    window = (*(1,) * (mask.ndim - 3), 2 * margin + 1, 2 * margin + 1, 1)
+    return -jax.lax.reduce_window(-mask, -jnp.inf, jax.lax.max, window, (1,) * mask.ndim, "SAME") if margin else mask
 
 
 def _answer(model: Any, batch: Batch) -> Array:
