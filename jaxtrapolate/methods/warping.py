@@ -58,7 +58,7 @@ def occlusion_warp() -> Method:
 
 
 _GUIDES = ("albedo", "normal")
-ROWS = 240  # of frames that kernels of 10 pixels suit; see experiments/guided_reach.py
+ROWS = 180  # of frames that kernels of 10 pixels suit; see experiments/guided_reach.py
 
 
 def guides(target, source):
@@ -99,7 +99,7 @@ def guided(*, rows: int | None = ROWS) -> Method:
         rows: of frames that the kernels suit; in larger ones holes are led further off. `None` = by the kernels alone.
 
     References:
-        Wu et al. 2023 (ExtraSS), section 4.2. Departure: `far_motion` before it, in frames of 480 rows or more.
+        Wu et al. 2023 (ExtraSS), section 4.2. Departure: `far_motion` before it, in frames of 360 rows or more.
     """
     stages = (REPROJECT, HOLES, hindsight_stage(), demodulate_stage(), guided_stage(rows=rows), modulate_stage(), SKY)
     return Method("guided_warp", stages, past=2)
