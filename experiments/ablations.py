@@ -206,6 +206,7 @@ def main() -> None:
     parser.add_argument("--windows", type=int, default=56, help="of each scene")
     parser.add_argument("--frame", type=int, default=13, help="of each test sequence, odd and at least 5")
     options = parser.parse_args()
+    jx.keep_memory()
     options.workdir.mkdir(parents=True, exist_ok=True)
     stored = {name: examples(name, options.windows, options.workdir) for name in MOVING}
     scorer = Scorer(options.frame)

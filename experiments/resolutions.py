@@ -78,6 +78,7 @@ def main() -> None:
     parser.add_argument("--times", action="store_true", help="times only")
     parser.add_argument("--errors", action="store_true", help="errors only")
     options = parser.parse_args()
+    jx.keep_memory()
     content: dict[str, Any] = json.loads(options.output.read_text()) if options.output.exists() else {}
     known, scenes = methods(), options.scenes.split(",")
     for size in options.sizes.split(","):
