@@ -296,7 +296,7 @@ def test_render_check_and_demo(capsys, tmp_path):
     code, out, _ = run(capsys, "check", dump)
     assert code == 0
     assert "as in use" in out
-    code, out, _ = run(capsys, "demo", "--output", tmp_path / "demo", "--frames", 6, "--size", "96x54")
+    code, out, _ = run(capsys, "demo", "--output", tmp_path / "demo", "--frames", 8, "--size", "96x54")
     assert code == 0
     results = json.loads((tmp_path / "demo" / "results.json").read_text())
     assert results["methods"]["guided_warp"]["psnr"] > results["methods"]["warp"]["psnr"]

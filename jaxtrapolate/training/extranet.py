@@ -26,7 +26,7 @@ from jaxtrapolate.training.windows import WindowOptions, Windows, check_crop, va
 _BRIGHTEST = 16.0  # in the log domain; above it nothing is told apart
 _DARKEST = 1e-3
 _LEAST = 1e-12  # the sum of weights that are all 0
-_LEAST_ERROR, _LEAST_HOLE_ERROR = 1e-6, 1e-4  # squared errors: few hole pixels that are all but right teach nothing
+_LEAST_ERROR, _LEAST_HOLE_ERROR = 1e-6, 1e-5  # squared errors: few hole pixels that are all but right teach nothing
 
 
 @dataclasses.dataclass(frozen=True)
