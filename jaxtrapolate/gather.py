@@ -100,6 +100,17 @@ def _weigh_jvp(primals, tangents):
     return weigh(value, weight), used * d_weight + d_value * weight
 
 
+def root(square: Array) -> Array:
+    """The square root, with derivative 0 at 0.
+
+    XLA on a CPU computes a value again in each loop that reads it, and rounds it differently: 0 in one may be 1e-16 in
+    another. So what stands in for 0, where a derivative would be infinite, has to be as small as what is near it.
+    """
+    positive = square > 0
+    least = max(1e-20, float(jnp.finfo(square.dtype).tiny))
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, least)), 0)
+
+
 def all_finite(image):
     """Whether an image may be weighted with the plain product; an overflow of the sum only takes the slower way."""
     return jnp.isfinite(jnp.sum(image))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image
-from jaxtrapolate.gather import backward_warp, cell, inside, landing, sample, take_offsets
+from jaxtrapolate.gather import backward_warp, cell, inside, landing, root, sample, take_offsets
 from jaxtrapolate.records import GBuffer, check_gbuffer, record
 
 Taps = Literal["weighted", "nearest", "release"]
@@ -46,12 +46,6 @@ def _dot(a, b):
     return cast(Array, sum(terms))  # there is a channel, so that it is not the int 0
 
 
-def _root(squared):
-    """The square root, with gradient 0 at 0."""
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
-
-
 def _footprint(position):
     """The distance of each pixel's position to the nearer of its neighbours, the larger one of the two axes."""
     result = None
@@ -63,7 +57,7 @@ def _footprint(position):
         first, last = (jax.lax.slice_in_dim(squared, *ends, axis=axis) for ends in ((0, 1), (-1, None)))
         nearer = jnp.minimum(jnp.concatenate([first, squared], axis), jnp.concatenate([squared, last], axis))
         result = nearer if result is None else jnp.maximum(result, nearer)
-    return jnp.zeros_like(position[..., :1]) if result is None else _root(result)
+    return jnp.zeros_like(position[..., :1]) if result is None else root(result)
 
 
 def _taps(image, x, y, taps):
@@ -154,7 +148,7 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
             concerned &= (target.sky < 0.5) | (sample(source.sky, x, y, filter="nearest") < 0.5)
         if soft:
             limit = jnp.where(limit > 0, limit, jnp.finfo(limit.dtype).tiny)
-            distance = _root(jnp.where(jnp.isfinite(farthest), farthest, 0))
+            distance = root(jnp.where(jnp.isfinite(farthest), farthest, 0))
             excess = jnp.where(jnp.isfinite(farthest), distance / limit - 1, 1e6)
             position = jnp.where(concerned, _soft(excess, softness), 0)
         else:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image
-from jaxtrapolate.gather import all_finite, inside, pixel_grid, sample, where_finite
+from jaxtrapolate.gather import all_finite, inside, pixel_grid, root, sample, where_finite
 from jaxtrapolate.records import record
 from jaxtrapolate.strips import by_strips, rows_of
 
@@ -209,9 +209,9 @@ def missed_by(at, value, fraction, pixels) -> tuple[Array, Array]:
     known = jnp.where(jnp.isfinite(value), value, 0)
     x, y = (at[..., k] + fraction * known[..., k] - pixels[..., k] for k in (0, 1))
     square = (x * x + y * y)[..., None]
-    usual = (square > 0) & (square < jnp.inf) & _finite(value)
-    error = jnp.where(usual, jnp.sqrt(jnp.where(usual, square, 1)), jnp.where(square == 0, 0, jnp.inf))
-    return known, jnp.where(_finite(value), error, jnp.inf)
+    usual = square < jnp.inf
+    error = root(jnp.where(usual, square, jnp.finfo(square.dtype).max))
+    return known, jnp.where(usual & _finite(value), error, jnp.inf)
 
 
 def _search_part(sources, top, rows, *, iterations, solver, filter):

@@ -16,6 +16,7 @@ from hypothesis.extra.numpy import arrays
 from oracles import SIZES, inner_motion, random, random_motion
 
 import jaxtrapolate as jx
+from jaxtrapolate.gather import root
 
 pytestmark = pytest.mark.usefixtures("strict")
 
@@ -381,3 +382,12 @@ def test_numpy_arrays_are_taken(unchecked):
         warnings.simplefilter("error")
         image = random(5, 7, 2)
         np.testing.assert_array_equal(jx.backward_warp(image, np.zeros((5, 7, 2), np.float32)), image)
+
+
+def test_root():
+    """Of 0 it and its derivatives are 0; near 0, and with infinities, the square root."""
+    square = jnp.float32([0, 1e-30, 1e-16, 4, jnp.inf])
+    np.testing.assert_allclose(root(square), np.sqrt(np.asarray(square, np.float64)), rtol=1e-6)
+    slope = jax.grad(root)
+    assert slope(jnp.float32(0)) == 0 and jax.grad(slope)(jnp.float32(0)) == 0
+    np.testing.assert_allclose(slope(jnp.float32(4)), 0.25)
