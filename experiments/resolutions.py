@@ -78,6 +78,8 @@ def main() -> None:
     parser.add_argument("--times", action="store_true", help="times only")
     parser.add_argument("--errors", action="store_true", help="errors only")
     options = parser.parse_args()
+    if not set(options.sizes.split(",")) <= set(SIZES):
+        parser.error(f"--sizes: expected some of {','.join(SIZES)}, got {options.sizes}")
     jx.keep_memory()
     content: dict[str, Any] = json.loads(options.output.read_text()) if options.output.exists() else {}
     known, scenes = methods(), options.scenes.split(",")
