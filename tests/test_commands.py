@@ -8,7 +8,9 @@ import pytest
 from synthetic import make_frame, make_keyframe
 
 import jaxtrapolate as jx
+from jaxtrapolate.commands.inputs import terminal
 from jaxtrapolate.commands.main import main
+from jaxtrapolate.commands.tables import print_table
 from jaxtrapolate.files import read_exr, read_png, write_png, write_unreal_frame
 from jaxtrapolate.files.packed import encode_motion
 
@@ -331,3 +333,20 @@ def test_check_finds_the_convention_of_real_input(data, name, change):
     assert len(tried) == 12
     assert tried[0][0] == MotionConvention.parse(expected, base=stated)
     assert tried[0][1] > tried[1][1] + 1
+
+
+def test_brackets_are_printed(capsys):
+    """In file names, and in what to install."""
+    results = {
+        "input": "clip[final]",
+        "size": [2, 4],
+        "frames": [1],
+        "metrics": {},
+        "methods": {"warp": {"psnr": 30.0, "ms": {"median": 1.0, "compile": None}, "by_cause": {}}},
+        "skipped": {"dis": 'pip install "jaxtrapolate[flow]"'},
+        "notes": ["[a]"],
+    }
+    print_table(results, terminal())
+    out = capsys.readouterr().out
+    for text in ("clip[final]", '"jaxtrapolate[flow]"', "note: [a]"):
+        assert text in out

@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from jaxtrapolate.commands.inputs import add_input, open_input, open_methods, progress
+from jaxtrapolate.commands.inputs import add_input, open_input, open_methods, progress, terminal
 from jaxtrapolate.evaluation import arguments, display, held_back, windows
 from jaxtrapolate.files import MotionConvention, Sequence, gaps, prefetch, runs
 from jaxtrapolate.gather import backward_warp
@@ -39,7 +39,7 @@ def add_parser(subparsers: Any) -> None:
 def run(options: argparse.Namespace) -> None:
     """Runs the command."""
     sequence = open_input(options.input, motion=options.motion, strict=options.strict)
-    console, out = Console(stderr=True), Console()
+    console, out = terminal(stderr=True), terminal()
     with progress(console) as bar:
         buffers, nonfinite = _scan(sequence, bar)
         tried = try_conventions(sequence, bar)

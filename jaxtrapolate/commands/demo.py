@@ -3,10 +3,8 @@
 import argparse
 from typing import Any
 
-from rich.console import Console
-
 from jaxtrapolate.commands.evaluate import evaluate
-from jaxtrapolate.commands.inputs import open_methods, output_folder, parse_size, steps
+from jaxtrapolate.commands.inputs import open_methods, output_folder, parse_size, steps, terminal
 from jaxtrapolate.commands.tables import print_table
 from jaxtrapolate.methods import method_names
 
@@ -31,10 +29,10 @@ def run(options: argparse.Namespace) -> None:
     folder = output_folder(options.output)
     sequence = SceneSequence("demo", frames=options.frames, size=parse_size(options.size))
     methods, unavailable = open_methods(method_names())
-    console = Console(stderr=True)
+    console = terminal(stderr=True)
     with steps(console) as step:
         results = evaluate(sequence, methods, folder, unavailable=unavailable, step=step)
-    print_table(results, Console())
+    print_table(results, terminal())
     console.print(
         f"open {folder / 'report.html'}; numbers in {folder / 'results.json'}", soft_wrap=True, highlight=False
     )

@@ -12,7 +12,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from rich.console import Console
 
 from jaxtrapolate import __version__
 from jaxtrapolate.checks import check_present
@@ -25,6 +24,7 @@ from jaxtrapolate.commands.inputs import (
     open_metrics,
     output_folder,
     steps,
+    terminal,
 )
 from jaxtrapolate.commands.kept import Kept, read_json, write_json
 from jaxtrapolate.commands.many import evaluate_many
@@ -78,7 +78,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the command; 2 where some of several inputs could not be used."""
-    console, out = Console(stderr=True), Console()
+    console, out = terminal(stderr=True), terminal()
     methods, unavailable = open_methods(options.methods, weights=options.weights)
     metrics = open_metrics(options.metrics)
     inputs = named_inputs(options.inputs, **{n: getattr(options, n) for n in ("motion", "strict", "size", "length")})

@@ -8,10 +8,17 @@ from typing import Any
 
 import jax
 import numpy as np
-from rich.console import Console
 
 from jaxtrapolate import __version__
-from jaxtrapolate.commands.inputs import add_input, add_weights, open_input, open_methods, output_folder, progress
+from jaxtrapolate.commands.inputs import (
+    add_input,
+    add_weights,
+    open_input,
+    open_methods,
+    output_folder,
+    progress,
+    terminal,
+)
 from jaxtrapolate.files import InputError, Sequence, runs, write_frame
 from jaxtrapolate.files.atomic import atomic_path
 from jaxtrapolate.forecast import forecast
@@ -37,7 +44,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Runs the command."""
-    console = Console(stderr=True)
+    console = terminal(stderr=True)
     if options.factor < 2:
         raise InputError(f"--factor: expected 2 or more, got {options.factor}")
     method = _one(*open_methods(options.method, option="--method", weights=options.weights))

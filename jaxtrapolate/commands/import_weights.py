@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import numpy as np
 from flax import nnx
-from rich.console import Console
 
+from jaxtrapolate.commands.inputs import terminal
 from jaxtrapolate.files import InputError
 from jaxtrapolate.files.atomic import os_input_error
 from jaxtrapolate.methods import load
@@ -64,4 +64,4 @@ def run(options: argparse.Namespace) -> None:
         raise os_input_error(source, error) from error
     except ValueError as error:
         raise InputError(str(error)) from error
-    Console().print(f"{path}\nuse it with --weights {method}={path}", soft_wrap=True, highlight=False)
+    terminal().print(f"{path}\nuse it with --weights {method}={path}", soft_wrap=True, highlight=False)

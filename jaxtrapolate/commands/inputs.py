@@ -248,10 +248,15 @@ def output_folder(text: str) -> Path:
     return folder
 
 
+def terminal(*, stderr: bool = False) -> Console:
+    """Where a command prints, as it is: brackets in a name are no markup."""
+    return Console(stderr=stderr, markup=False)
+
+
 def progress(console: Console) -> Progress:
     """A progress bar on stderr, gone when it is done; none where stderr is no terminal."""
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),

@@ -3,9 +3,7 @@
 import argparse
 from typing import Any
 
-from rich.console import Console
-
-from jaxtrapolate.commands.inputs import output_folder, parse_size, progress
+from jaxtrapolate.commands.inputs import output_folder, parse_size, progress, terminal
 from jaxtrapolate.files import InputError, write_unreal_frame
 
 
@@ -35,7 +33,7 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(f"no scene {options.scene!r}; the embedded ones are {', '.join(scene_names())}")
     folder = output_folder(options.output)
     sequence = SceneSequence(options.scene, seed=options.seed, frames=options.frames, size=size)
-    console = Console(stderr=True)
+    console = terminal(stderr=True)
     name = options.scene.title()
     with progress(console) as bar:
         for number in bar.track(sequence.numbers, description="render"):

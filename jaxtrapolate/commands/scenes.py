@@ -7,9 +7,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
+from rich.text import Text
 
-from jaxtrapolate.commands.inputs import parse_size, progress
+from jaxtrapolate.commands.inputs import parse_size, progress, terminal
 from jaxtrapolate.files import InputError
 from jaxtrapolate.files.atomic import atomic_path
 
@@ -43,15 +43,15 @@ def run(options: argparse.Namespace) -> None:
     wrong = [name for name in names if name not in scene_names()]
     if wrong:
         raise InputError(f"no scene {', '.join(wrong)}; the embedded ones are {', '.join(scene_names())}")
-    out = Console()
+    out = terminal()
     if not (options.statistics or options.speed):
         for name in names:
             first = (SCENES[name].__doc__ or "").splitlines()[0]
-            out.print(f"[bold]{name}[/bold]: {first}", soft_wrap=True, highlight=False)
+            out.print(Text.assemble((name, "bold"), f": {first}"), soft_wrap=True)
         return
     size = parse_size(options.size or ("1024x768" if options.statistics else "320x180"))
     found: dict[str, Any] = {"size": list(size)}
-    with progress(Console(stderr=True)) as bar:
+    with progress(terminal(stderr=True)) as bar:
         if options.statistics:
             rows: dict[str, list] = {name: [] for name in names}
             for name, seed in bar.track([(n, s) for n in names for s in TEST_SEEDS], description="statistics"):

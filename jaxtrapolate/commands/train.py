@@ -5,9 +5,7 @@ import sys
 import tomllib
 from typing import Any
 
-from rich.console import Console
-
-from jaxtrapolate.commands.inputs import output_folder, steps
+from jaxtrapolate.commands.inputs import output_folder, steps, terminal
 from jaxtrapolate.files import InputError
 
 
@@ -45,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
     _join(options)
     from jaxtrapolate.training import TrainingError, load_config, train_and_evaluate
 
-    console = Console(stderr=True)
+    console = terminal(stderr=True)
     config = load_config(options.config, dict(map(_setting, options.set)))
     folder = output_folder(options.workdir)
     try:
