@@ -204,7 +204,7 @@ def test_networks_without_peers(networks, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_networks_of_pytorch_and_openvino_agree(networks, tmp_path):
     pytest.importorskip("torch")
-    status, results = run_networks(networks, tmp_path, "--only", "extranet;gated convolution")
+    status, results = run_networks(networks, tmp_path, "--only", "extranet,gated convolution")
     assert status == 0
     for row in results["networks"]:
         assert {"torch", "torch, channels last"} <= set(row["peers"])
