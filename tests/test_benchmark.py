@@ -202,6 +202,7 @@ def test_networks_without_peers(networks, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # those of the peers
 def test_networks_of_pytorch_and_openvino_agree(networks, tmp_path):
     pytest.importorskip("torch")
     status, results = run_networks(networks, tmp_path, "--only", "extranet,gated convolution")
