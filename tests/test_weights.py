@@ -493,8 +493,9 @@ def test_damage_is_noticed(tmp_path):
     plain.write_bytes(content)
     with pytest.raises(ValueError, match="name that ends in the file's hash"):
         weights.load_weights(plain)
-    with pytest.raises(FileNotFoundError):
-        weights.load_weights(tmp_path / "extranet-00000000.npz")
+    for absent in ("extranet-00000000.npz", "model"):
+        with pytest.raises(FileNotFoundError):
+            weights.load_weights(tmp_path / absent)
 
 
 def test_what_no_file_may_hold(tmp_path):

@@ -98,10 +98,11 @@ def load_weights(path: str | PathLike[str]) -> Weights:
         ValueError: one line that names the file: a name without a hash, another hash, more than 2 MB, or no weights.
     """
     path = Path(path)
+    size = path.stat().st_size
     match = _NAME.fullmatch(path.name)
     if match is None:
         raise ValueError(f"{path}: expected a name that ends in the file's hash, as in extranet-1a2b3c4d.npz")
-    if (size := path.stat().st_size) > LARGEST:
+    if size > LARGEST:
         raise ValueError(f"{path}: {size} bytes, expected at most {LARGEST}")
     content = path.read_bytes()
     if (found := _hash(content)) != match["hash"]:
