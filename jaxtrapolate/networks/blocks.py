@@ -76,8 +76,11 @@ def _convolved(x: Array, *convolutions: nnx.Conv) -> list[Array]:
     )
     around = kernel.shape[0] // 2
     strides, layout = cast(tuple[int, int], convolutions[0].strides), ("NHWC", "HWIO", "NHWC")
-    y = jax.lax.conv_general_dilated(x, kernel, strides, [(around, around)] * 2, dimension_numbers=layout)
-    y = y + bias[None, None, None]
+    wide = jnp.promote_types(x.dtype, jnp.float32)  # of the sums: half precision is rounded once, after the bias
+    y = jax.lax.conv_general_dilated(
+        x, kernel, strides, [(around, around)] * 2, dimension_numbers=layout, preferred_element_type=wide
+    )
+    y = (y + bias.astype(wide)[None, None, None]).astype(x.dtype)
     ends = np.cumsum(outputs)
     return [y[..., end - count : end] for end, count in zip(ends, outputs, strict=True)]
 
