@@ -1,54 +1,10 @@
-"""Frame extrapolation and interpolation for rendered sequences, as pure jitted JAX functions."""
+"""Frame extrapolation and interpolation for rendered sequences, as pure jitted JAX functions.
+
+Names are imported when they are first used; `__init__.pyi` says where from.
+"""
+
+import lazy_loader
 
 from jaxtrapolate._version import __version__ as __version__
-from jaxtrapolate.assisted import Interpolation as Interpolation
-from jaxtrapolate.assisted import Offsets as Offsets
-from jaxtrapolate.assisted import interpolate_assisted as interpolate_assisted
-from jaxtrapolate.assisted import overlay as overlay
-from jaxtrapolate.bidirectional import interpolate_bidirectional as interpolate_bidirectional
-from jaxtrapolate.causes import CAUSES as CAUSES
-from jaxtrapolate.causes import cause_map as cause_map
-from jaxtrapolate.causes import disoccluded as disoccluded
-from jaxtrapolate.flows import CompletedFlows as CompletedFlows
-from jaxtrapolate.flows import camera_flow as camera_flow
-from jaxtrapolate.flows import complete_flows as complete_flows
-from jaxtrapolate.forecast import forecast as forecast
-from jaxtrapolate.gather import backward_warp as backward_warp
-from jaxtrapolate.gather import in_frame as in_frame
-from jaxtrapolate.guided import guided_warp as guided_warp
-from jaxtrapolate.holes import HoleMasks as HoleMasks
-from jaxtrapolate.holes import hole_masks as hole_masks
-from jaxtrapolate.memory import keep_memory as keep_memory
-from jaxtrapolate.methods import Method as Method
-from jaxtrapolate.methods import Stage as Stage
-from jaxtrapolate.methods import load as load
-from jaxtrapolate.methods import method_names as method_names
-from jaxtrapolate.metrics import psnr as psnr
-from jaxtrapolate.metrics import ssim as ssim
-from jaxtrapolate.motion import camera_motion as camera_motion
-from jaxtrapolate.motion import chain_motion as chain_motion
-from jaxtrapolate.motion import convert_motion as convert_motion
-from jaxtrapolate.motion import dilate_motion as dilate_motion
-from jaxtrapolate.motion import occlusion_motion as occlusion_motion
-from jaxtrapolate.radiance import demodulate as demodulate
-from jaxtrapolate.radiance import demodulation_divisor as demodulation_divisor
-from jaxtrapolate.radiance import log_decode as log_decode
-from jaxtrapolate.radiance import log_encode as log_encode
-from jaxtrapolate.radiance import modulate as modulate
-from jaxtrapolate.radiance import srgb_decode as srgb_decode
-from jaxtrapolate.radiance import srgb_encode as srgb_encode
-from jaxtrapolate.radiance import tonemap as tonemap
-from jaxtrapolate.radiance import tonemap_inverse as tonemap_inverse
-from jaxtrapolate.records import Camera as Camera
-from jaxtrapolate.records import Frame as Frame
-from jaxtrapolate.records import GBuffer as GBuffer
-from jaxtrapolate.records import Keyframe as Keyframe
-from jaxtrapolate.records import replace as replace
-from jaxtrapolate.runs import interpolate_run as interpolate_run
-from jaxtrapolate.runs import motion_blur as motion_blur
-from jaxtrapolate.scatter import splat as splat
-from jaxtrapolate.scatter import splat_nearest as splat_nearest
-from jaxtrapolate.search import Correspondence as Correspondence
-from jaxtrapolate.search import iterative_search as iterative_search
-from jaxtrapolate.starts import dual_start as dual_start
-from jaxtrapolate.starts import latest_start as latest_start
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

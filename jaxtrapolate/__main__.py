@@ -1,6 +1,8 @@
 """`python -m jaxtrapolate`."""
 
-from jaxtrapolate.commands.main import main
+import sys
+
+from jaxtrapolate.commands.main import script
 
 if __name__ == "__main__":
-    main()
+    sys.exit(script())

@@ -77,7 +77,9 @@ def test_what_inputs_name(tmp_path):
     assert names(["scenes:test"]) == [f"{n}-{s}" for n in scene_names() for s in TEST_SEEDS]
     assert names(["scenes:demo:7", "scenes:demo", "scenes:demo:0"]) == ["demo-7", "demo-0"]
     a, b = tmp_path / "a" / "Clip 1", tmp_path / "b" / "clip_1"
-    assert names([str(a), str(b), str(a.parent / ".." / "a" / "Clip 1")]) == ["Clip_1", "clip_1-2"]
+    assert names([str(a), str(b), str(a.parent / ".." / "a" / "Clip 1")]) == ["a-Clip_1", "b-clip_1"]
+    assert names([str(a), str(tmp_path / "a" / "other")]) == ["Clip_1", "other"]
+    assert names([str(a), str(a.with_name("Clip?1"))]) == ["Clip_1", "Clip_1-2"]
     assert names([str(a / "jaxtrapolate.toml")]) == ["Clip_1"]
 
 
@@ -85,7 +87,7 @@ def test_options_of_embedded_scenes(scenes):
     (one,) = named_inputs(["scenes:demo:3"], size="64x36", length=7)
     sequence = one.open()
     assert (sequence.name, sequence.size, sequence.numbers) == ("demo-3", (36, 64), tuple(range(7)))
-    with pytest.raises(InputError, match="--length: expected 1 or more, got 0"):
+    with pytest.raises(InputError, match=r"--length: expected a number from 1 to .*, got 0"):
         named_inputs(["scenes:demo"], length=0)
     with pytest.raises(InputError, match="--size, --length: are for embedded scenes"):
         named_inputs(["folder"], size="64x36")
@@ -119,7 +121,9 @@ def test_several_inputs(capsys, scenes, dump, tmp_path):
     assert code == 2
     said = [line for line in err.splitlines() if line.startswith("jaxtrapolate: ")]
     assert [line.split(": ")[1] for line in said] == [str(gone), "scenes:moon"]
-    assert sorted(p.name for p in output.iterdir()) == ["demo-1", "dump", "report.html", "results.json", "still-2"]
+    assert sorted(p.name for p in output.iterdir()) == [
+        *("demo-1", "dump", "report.html", "results.json", "run.json", "still-2"),
+    ]
     single = {n: read(output / n / "results.json") for n in ("dump", "demo-1", "still-2")}
     assert [r["size"] for r in single.values()] == [[32, 48], [36, 48], [36, 48]]
     whole = read(output / "results.json")
@@ -182,10 +186,14 @@ def test_a_killed_run_goes_on_and_what_is_finished_stays(capsys, scenes, tmp_pat
     assert run(capsys, *arguments, "--length", 4)[0] == 0  # others are finished: fewer frames, whose scores are kept
     assert scored == []
     assert [i["frames"] for i in read(tmp_path / "results.json")["inputs"]] == [2, 2]
-    assert run(capsys, *arguments, "--length", 4, "--size", "32x24")[0] == 0
-    assert len(scored) == 4  # other images: nothing is kept
+    code, _, err = run(capsys, *arguments, "--length", 4, "--size", "32x24")
+    assert (code, scored) == (2, [])  # other images
+    assert err.count("size was [32, 48], is now [24, 32]") == 2
+    assert run(capsys, *arguments, "--length", 4, "--size", "32x24", "--fresh")[0] == 0
+    assert len(scored) == 4
     (tmp_path / "demo-1" / "report.html").unlink()
     assert run(capsys, *arguments, "--length", 4, "--size", "32x24")[0] == 0
+    assert len(scored) == 4
     assert (tmp_path / "demo-1" / "report.html").exists()
 
 
@@ -295,7 +303,7 @@ def test_metrics_by_name(capsys, scenes, tmp_path, monkeypatch):
 
     assert run(capsys, *arguments)[0] == 0
     assert len(clips) == 2  # kept
-    assert run(capsys, *arguments, "--size", "48x20")[0] == 0
+    assert run(capsys, *arguments, "--size", "48x20", "--fresh")[0] == 0
     small = read(tmp_path / "results.json")
     assert small["methods"]["warp"]["flip"] is None
     assert "flip: made: expected at least 32 pixels" in small["notes"]
@@ -341,7 +349,7 @@ def test_video_is_written_and_linked(capsys, scenes, tmp_path):
         assert image.n_frames == 6
         assert image.info["duration"] == 100
     assert 'href="../films/a.gif"' in (output / "report.html").read_text()
-    several = [*arguments, "gif"]
+    several = [*arguments, "gif", "--fresh"]
     several[2:2] = ["scenes:demo:1"]
     assert run(capsys, *several)[0] == 0
     assert (output / "demo-0" / "video.gif").exists()

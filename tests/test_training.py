@@ -27,7 +27,6 @@ from jaxtrapolate.training import (
     train_and_evaluate,
 )
 from jaxtrapolate.training.checkpoints import Checkpoints, model_arrays
-from jaxtrapolate.training.config import keep_config
 from jaxtrapolate.training.journal import read_metrics
 from jaxtrapolate.training.step import make_step, schedule, transformation
 from jaxtrapolate.training.tasks import round_key
@@ -79,7 +78,7 @@ def whole(tmp_path_factory):
 
 def test_what_a_run_writes(whole):
     _, workdir, scores = whole
-    assert json.loads((workdir / "config.json").read_text())["options"]["wobble"] == 0.1
+    assert json.loads((workdir / "run.json").read_text())["settings"]["options"]["wobble"] == 0.1
     assert [row[0] for row in numbers(workdir)] == list(range(2, 25, 2))
     ((_, first), (_, last)) = numbers(workdir, "validation", ("negative",))
     assert last > first
@@ -368,9 +367,7 @@ def test_score_that_validation_does_not_give(tmp_path):
 
 
 def test_another_configuration_is_refused(whole):
-    settings, workdir, _ = whole
-    path = workdir / "config.json"
-    keep_config(settings, path)
+    _, workdir, _ = whole
     changed = config(ToyOptions(wobble=0.2), average=0.9, optimizer=Optimizer(learning_rate=0.03, clip=1.0))
     with pytest.raises(InputError) as error:
         train_and_evaluate(changed, workdir)

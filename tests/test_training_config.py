@@ -1,7 +1,5 @@
 """Configurations of training runs, from tables, files and the command line."""
 
-import json
-
 import pytest
 from toy_task import ToyOptions
 
@@ -101,15 +99,20 @@ def test_command_with_a_bad_file(capsys, tmp_path, text, message):
     assert not (tmp_path / "run").exists()
 
 
-def test_command_with_changed_settings(capsys, tmp_path):
+def test_command_with_changed_settings(capsys, tmp_path, monkeypatch):
     workdir = ("--workdir", str(tmp_path / "run"))
     file = toml(tmp_path / "run.toml")
     changes = ["steps=2", "optimizer.clip = 0.5", "options.crop=[4, 4]", f"start={tmp_path}/none-12345678.npz"]
     given = [word for change in changes for word in ("--set", change)]
     assert "none-12345678.npz: does not exist" in fails(capsys, "train", file, *workdir, *given)
-    kept = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert (kept["steps"], kept["optimizer"]["clip"], kept["options"]["crop"]) == (2, 0.5, [4, 4])
-    assert kept["start"] == f"{tmp_path}/none-12345678.npz"
+    asked = []
+    with monkeypatch.context() as patch:
+        patch.setattr("jaxtrapolate.training.train_and_evaluate", lambda config, *_, **__: asked.append(config) or {})
+        assert main(["train", str(file), *workdir, *given]) == 0
+    capsys.readouterr()
+    (config,) = asked
+    assert (config.steps, config.optimizer.clip, config.options.crop) == (2, 0.5, (4, 4))
+    assert config.start == f"{tmp_path}/none-12345678.npz"
     for change, message in [
         ("sped=1", "sped: no such setting"),
         ("options.crops=1", "options.crops: no such setting"),

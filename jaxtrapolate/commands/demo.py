@@ -1,10 +1,11 @@
 """`jaxtrapolate demo`: an embedded scene, every method, error against run time, pictures, a report."""
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from jaxtrapolate.commands.evaluate import evaluate
-from jaxtrapolate.commands.inputs import open_methods, output_folder, parse_size, steps, terminal
+from jaxtrapolate.commands.inputs import add_fresh, check_count, open_methods, parse_size, steps, terminal
 from jaxtrapolate.commands.tables import print_table
 from jaxtrapolate.methods import method_names
 
@@ -19,6 +20,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--output", default="demo", metavar="DIR", help="for results, pictures and report (demo)")
     parser.add_argument("--frames", type=int, default=16, metavar="N", help="how many frames (16)")
     parser.add_argument("--size", default="480x270", metavar="WxH", help="width and height in pixels (480x270)")
+    add_fresh(parser)
     parser.set_defaults(run=run)
 
 
@@ -26,12 +28,13 @@ def run(options: argparse.Namespace) -> None:
     """Runs the command."""
     from jaxtrapolate.scenes import SceneSequence
 
-    folder = output_folder(options.output)
-    sequence = SceneSequence("demo", frames=options.frames, size=parse_size(options.size))
+    folder = Path(options.output)
+    frames = check_count("--frames", options.frames)
+    sequence = SceneSequence("demo", frames=frames, size=parse_size(options.size))
     methods, unavailable = open_methods(method_names())
     console = terminal(stderr=True)
     with steps(console) as step:
-        results = evaluate(sequence, methods, folder, unavailable=unavailable, step=step)
+        results = evaluate(sequence, methods, folder, unavailable=unavailable, fresh=options.fresh, step=step)
     print_table(results, terminal())
     console.print(
         f"open {folder / 'report.html'}; numbers in {folder / 'results.json'}", soft_wrap=True, highlight=False

@@ -13,20 +13,19 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxtrapolate import __version__
+from jaxtrapolate._version import __version__
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.commands.inputs import (
     Step,
+    add_fresh,
     add_input,
     add_weights,
     named_inputs,
     open_methods,
     open_metrics,
-    output_folder,
     steps,
     terminal,
 )
-from jaxtrapolate.commands.kept import Kept, read_json, write_json
 from jaxtrapolate.commands.many import evaluate_many
 from jaxtrapolate.commands.pictures import write_pictures
 from jaxtrapolate.commands.tables import decibels, print_table
@@ -43,10 +42,11 @@ from jaxtrapolate.evaluation import (
     time_stages,
     windows,
 )
-from jaxtrapolate.files import InputError, Sequence, gaps
+from jaxtrapolate.files import InputError, Sequence, gaps, runs
 from jaxtrapolate.methods import Method
 from jaxtrapolate.metrics import Metric, metric_names
 from jaxtrapolate.metrics import load as load_metric
+from jaxtrapolate.output import Output, code, open_output, read_json, writable_folder, write_json
 from jaxtrapolate.report import write_report
 from jaxtrapolate.timing import machine
 from jaxtrapolate.weights import fingerprint
@@ -73,11 +73,12 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--frames", metavar="N,N,...", help="score only these held-back frames")
     parser.add_argument("--pictures", type=int, default=2, metavar="N", help="frames shown in the report (default 2)")
     Video.add_arguments(parser)
+    add_fresh(parser)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Runs the command; 2 where some of several inputs could not be used."""
+    """Runs the command; 2 where some of several inputs could not be used, or no method ran."""
     console, out = terminal(stderr=True), terminal()
     methods, unavailable = open_methods(options.methods, weights=options.weights)
     metrics = open_metrics(options.metrics)
@@ -89,18 +90,23 @@ def run(options: argparse.Namespace) -> int:
         "frames": options.frames,
         "pictures": options.pictures,
         "video": video,
+        "fresh": options.fresh,
     }
+    folder = Path(options.output)
     if len(inputs) == 1:
-        sequence, folder = inputs[0].open(), output_folder(options.output)
+        sequence = inputs[0].open()
         with steps(console) as step:
             results, failed = evaluate(sequence, methods, folder, step=step, **chosen), {}
     else:
-        folder = output_folder(options.output)
         with steps(console) as step:
-            results, failed = evaluate_many(inputs, partial(evaluate, methods=methods, **chosen), folder, step=step)
+            results, failed = evaluate_many(
+                inputs, partial(evaluate, methods=methods, **chosen), folder, fresh=options.fresh, step=step
+            )
     if results is not None:
         print_table(results, out)
         console.print(f"{folder / 'results.json'} and {folder / 'report.html'}", soft_wrap=True, highlight=False)
+        for name, reason in results["skipped"].items():
+            print(f"jaxtrapolate: {name} was left out: {reason}", file=sys.stderr)
     for reason in failed.values():
         print(f"jaxtrapolate: {reason}", file=sys.stderr)
     return 2 if failed else 0
@@ -116,73 +122,109 @@ def evaluate(
     frames: str | None = None,
     pictures: int = 2,
     video: Video | None = None,
+    fresh: bool = False,
     reuse: bool = False,
     step: Step,
 ) -> dict[str, Any]:
     """Scores methods on a sequence; writes results.json, pictures and report.html to `folder`, and returns the results.
 
     The scores of each frame are kept in `folder/scores` as they come, so that a run that was killed goes on where it
-    was. `unavailable` says of methods that were asked for and cannot be had why. With `reuse`, results of the same
-    settings that are there already are returned as they are.
+    was, and a run with other methods, metrics or frames computes what is not there yet; see `jaxtrapolate.output` for
+    what has to be equal. `unavailable` says of methods that were asked for and cannot be had why. `fresh` starts anew.
+    With `reuse`, results of the same request that are there already are returned as they are.
     """
     metrics = {n: load_metric(n) for n in DEFAULT_METRICS} if metrics is None else metrics
-    identity = {
-        "version": __version__,
-        "input": sequence.name,
-        "motion": str(sequence.convention),
-        "size": list(sequence.size),
-        "methods": [*methods, *(unavailable or {})],
-        "weights": {
-            name: fingerprint(method.state) for name, method in methods.items() if jax.tree.leaves(method.state)
-        },
-        "metrics": list(metrics),
-    }
-    settings = identity | {
-        "numbers": [*sequence.numbers[:1], *sequence.numbers[-1:], len(sequence.numbers)],
-        "frames": frames,
-        "pictures": pictures,
-        "video": None if video is None else f"{video.path.name}, {video.fps:g} fps",
-    }
-    if reuse and (there := _finished(folder, settings)) is not None:
-        return there
-    usable, skipped, left_out = _usable(sequence, methods, unavailable or {})
-    if not usable:
-        raise InputError(f"{sequence.name}: no method can run: {'; '.join(f'{n}: {w}' for n, w in skipped.items())}")
-    past, future = max(m.past for m in usable.values()), max(m.future for m in usable.values())
-    numbers = _chosen(held_back(sequence, past=past, future=future), frames, sequence, past)
-    kept = Kept(folder / "scores", identity)
-    compile_ms: dict[str, float] = kept.read("compile") or {}
-    stages: dict[str, Any] = kept.read("stages") or {}
-    scores: dict[int, dict[str, Any]] = {n: s for n in numbers if (s := kept.read(f"{n:04d}")) is not None}
-    todo = [n for n in numbers if n not in scores]
-    step("evaluate", len(scores), len(numbers))
+    settings = {"inputs": "one", **sequence.identity(), "machine": machine_identity()}
+    with open_output(folder, "evaluate", settings, fresh=fresh) as output:
+        output.agree(
+            "weights",
+            {name: fingerprint(method.state) for name, method in methods.items() if jax.tree.leaves(method.state)},
+        )
+        requested = {
+            "version": __version__,
+            "code": code(),
+            "motion": str(sequence.convention),
+            "methods": [*methods, *(unavailable or {})],
+            "metrics": list(metrics),
+            "numbers": [*sequence.numbers[:1], *sequence.numbers[-1:], len(sequence.numbers)],
+            "frames": frames,
+            "pictures": pictures,
+            "video": None if video is None else f"{video.path.name}, {video.fps:g} fps",
+        }
+        usable, skipped, left_out = _usable(sequence, methods, unavailable or {})
+        past, future = max(m.past for m in usable.values()), max(m.future for m in usable.values())
+        numbers = _chosen(held_back(sequence, past=past, future=future), frames, sequence, past)
+        output.agree_frames(sequence, _needed(sequence, numbers, past, future), step=step)
+        if reuse and (there := _finished(output.folder, requested)) is not None:
+            return there
+        return _evaluate(
+            sequence, usable, numbers, output, metrics, requested, skipped, left_out, pictures, video, step
+        )
+
+
+def machine_identity() -> dict[str, Any]:
+    """What of the machine and its settings times depend on."""
+    keys = ("cpu", "cores_used", "versions", "backend", "gpu", "gpu_driver", "memory_kept", "settings")
+    known = machine()
+    return {key: known[key] for key in keys}
+
+
+def _needed(sequence: Sequence, numbers: list[int], past: int, future: int) -> list[int]:
+    """The frames that the windows of the held-back frames `numbers` consist of."""
+    before, behind = 2 * past - 1, max(0, 2 * future - 1)
+    found: set[int] = set()
+    for run in runs(sequence):
+        for number in set(numbers) & set(run):
+            at = run.index(number)
+            found |= set(run[max(0, at - before) : at + behind + 1])
+    return sorted(found)
+
+
+def _evaluate(
+    sequence: Sequence,
+    methods: dict[str, Method],
+    numbers: list[int],
+    output: Output,
+    metrics: dict[str, Metric],
+    requested: dict[str, Any],
+    skipped: dict[str, str],
+    left_out: dict[str, Any],
+    pictures: int,
+    video: Video | None,
+    step: Step,
+) -> dict[str, Any]:
+    """The results, of frames and methods that are scored here or were in an earlier run."""
+    folder = output.folder
+    past, future = max(m.past for m in methods.values()), max(m.future for m in methods.values())
+    kept = Scores(writable_folder(folder / "scores"), metrics)
+    scores = {number: kept.frame(number) for number in numbers}
+    todo = [n for n in numbers if any(name not in scores[n] for name in methods)]
+    step("evaluate", len(numbers) - len(todo), len(numbers))
     for window in windows(sequence, todo, past=past, future=future):
-        scores[window.number] = _score_window(sequence, window, usable, compile_ms, list(metrics.values()))
-        if not stages:
-            step("time stages", len(scores), len(numbers))
-            stages = {
-                name: {stage: t.summary() for stage, t in time_stages(method, window).items()}
-                for name, method in usable.items()
-            }
-            kept.write("stages", stages)
-        kept.write("compile", compile_ms)
-        kept.write(f"{window.number:04d}", scores[window.number])
-        step("evaluate", len(scores), len(numbers))
-    frame_scores = {name: [scores[n][name] for n in numbers] for name in usable}
-    clips, unscored = _score_clips(sequence, usable, numbers, metrics, kept, step, past=past, future=future)
+        lacking = {name: m for name, m in methods.items() if name not in scores[window.number]}
+        scores[window.number] |= _score_window(sequence, window, lacking, kept.compile_ms, list(metrics.values()))
+        unmeasured = {name: m for name, m in lacking.items() if name not in kept.stages}
+        if unmeasured:
+            step("time stages", numbers.index(window.number), len(numbers))
+            for name, method in unmeasured.items():
+                kept.stages[name] = {stage: t.summary() for stage, t in time_stages(method, window).items()}
+        kept.write(window.number, scores[window.number])
+        step("evaluate", numbers.index(window.number) + 1, len(numbers))
+    frame_scores = {name: [scores[n][name] for n in numbers] for name in methods}
+    clips, unscored = _score_clips(sequence, methods, numbers, metrics, kept, step, past=past, future=future)
     results = {
         "input": sequence.name,
         "machine": machine(),
         "size": list(sequence.size),
         "hdr": sequence.hdr,
-        "settings": settings | {"past": past, "future": future},
+        "settings": requested | {"past": past, "future": future},
         "metrics": {n: {"per": m.per, "better": m.better, "unit": m.unit} for n, m in metrics.items()},
-        "notes": _notes(sequence, numbers) + _unscored(frame_scores) + unscored,
+        "notes": _notes(sequence, numbers) + _costs(sequence, methods) + _unscored(frame_scores) + unscored,
         "frames": numbers,
         "methods": {
-            name: _summary(found, metrics, compile_ms.get(name))
+            name: _summary(found, metrics, kept.compile_ms.get(name))
             | clips.get(name, {})
-            | {"stages": stages.get(name, {}), "left_out": left_out[name], "frames": found}
+            | {"stages": kept.stages.get(name, {}), "left_out": left_out[name], "frames": found}
             for name, found in frame_scores.items()
         },
         "skipped": skipped,
@@ -190,16 +232,69 @@ def evaluate(
     step("pictures", len(numbers), len(numbers))
     shown = _worst_and_median(results, pictures)
     results["pictures"] = [
-        write_pictures(sequence, window, usable, folder)
+        write_pictures(sequence, window, methods, folder)
         for window in windows(sequence, shown, past=past, future=future)
     ]
     if video is not None:
         labels = {name: f"{name}, {decibels(m['psnr'])} dB" for name, m in results["methods"].items()}
-        path = video.write(sequence, numbers, usable, folder, labels=labels, past=past, future=future, step=step)
+        path = video.write(sequence, numbers, methods, folder, labels=labels, past=past, future=future, step=step)
         results["video"] = Path(os.path.relpath(path, folder)).as_posix()
     write_json(folder / "results.json", results)
     write_report(results, folder)
     return results
+
+
+class Scores:
+    """The scores of frames that outlive a killed run, a JSON file a frame, with times of compilation and of stages.
+
+    What is not of the shape that this version writes, or lacks a metric, counts as not there.
+    """
+
+    def __init__(self, folder: Path, metrics: dict[str, Metric]) -> None:
+        self._folder, self._metrics = folder, metrics
+        compiled, stages = (read_json(folder / f"{name}.json") for name in ("compile", "stages"))
+        compiled, stages = (v if isinstance(v, dict) else {} for v in (compiled, stages))
+        self.compile_ms: dict[str, float] = {n: v for n, v in compiled.items() if isinstance(v, int | float)}
+        self.stages: dict[str, Any] = {n: v for n, v in stages.items() if isinstance(v, dict)}
+
+    def frame(self, number: int) -> dict[str, dict[str, Any]]:
+        """The scores of a frame by method."""
+        entries = read_json(self._folder / f"{number:04d}.json")
+        entries = entries if isinstance(entries, dict) else {}
+        return {name: entry for name, entry in entries.items() if self._complete(entry, number)}
+
+    def _complete(self, entry: Any, number: int) -> bool:
+        if not isinstance(entry, dict) or entry.get("number") != number:
+            return False
+        numeric = all(isinstance(entry.get(key), int | float) for key in ("psnr", "ms"))
+        wanted = [m.name for m in self._metrics.values() if m.per != "clip" and m.name != "psnr"]
+        causes = entry.get("by_cause")
+        by_cause = isinstance(causes, dict) and all(
+            isinstance(c, dict) and all(isinstance(c.get(k), int | float) for k in ("psnr", "share"))
+            for c in causes.values()
+        )
+        scored = all(m in entry and isinstance(entry[m], int | float | None) for m in wanted)
+        return numeric and scored and by_cause and isinstance(entry.get("unscored", {}), dict)
+
+    def write(self, number: int, scores: dict[str, Any]) -> None:
+        """Keeps a frame's scores, beside those of methods that are not asked for now."""
+        path = self._folder / f"{number:04d}.json"
+        there = read_json(path)
+        write_json(self._folder / "compile.json", self.compile_ms)
+        write_json(self._folder / "stages.json", self.stages)
+        write_json(path, (there if isinstance(there, dict) else {}) | scores)
+
+    def clips(self, numbers: list[int]) -> dict[str, dict[str, float]]:
+        """The metrics of clips, by method, over just these frames."""
+        found = read_json(self._clip(numbers))
+        return {n: v for n, v in found.items() if isinstance(v, dict)} if isinstance(found, dict) else {}
+
+    def write_clips(self, numbers: list[int], found: dict[str, dict[str, float]]) -> None:
+        """Keeps the metrics of clips."""
+        write_json(self._clip(numbers), found)
+
+    def _clip(self, numbers: list[int]) -> Path:
+        return self._folder / f"clip-{zlib.crc32(repr(numbers).encode()):08x}.json"
 
 
 def _finished(folder: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
@@ -215,28 +310,60 @@ def _finished(folder: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
 def _usable(
     sequence: Sequence, methods: dict[str, Method], unavailable: dict[str, str]
 ) -> tuple[dict[str, Method], dict[str, str], dict[str, dict[str, list[str]]]]:
-    """The methods that the sequence has the buffers for, what the others miss, and what stages are left out of each."""
-    if not methods:
-        raise InputError("; ".join(unavailable.values()))
-    past, future = max(m.past for m in methods.values()), max(m.future for m in methods.values())
-    numbers = held_back(sequence, past=past, future=future)
-    if not numbers:
-        longest = 2 * past + 2 * future - (1 if future else 0)
-        raise InputError(
-            f"{sequence.name}: too short, {len(sequence.numbers)} frames; these methods need {longest} without a gap"
-        )
-    window = next(iter(windows(sequence, numbers[:1], past=past, future=future)))
-    if window.truth.color is None:
-        raise InputError(f"{sequence.name}: frame {window.number} has no colour to compare with; use generate")
+    """The methods that can be scored, why the others cannot, and what stages are left out of each that can.
+
+    Raises:
+        InputError: none can.
+    """
     usable, skipped, left_out = {}, dict(unavailable), {}
     for name, method in methods.items():
+        numbers = held_back(sequence, past=method.past, future=method.future)
+        if not numbers:
+            skipped[name] = (
+                f"too few frames, needs {_window_length(method)} in a row without a gap; the longest row of the "
+                f"{len(sequence.numbers)} has {max(map(len, runs(sequence)))}"
+            )
+            continue
+        window = next(iter(windows(sequence, numbers[:1], past=method.past, future=method.future)))
+        if window.truth.color is None:
+            raise InputError(f"{sequence.name}: frame {window.number} has no colour to compare with; use generate")
         given = arguments(method, window)
         try:
             method.active(*given)
             usable[name], left_out[name] = method, method.missing(*given)
         except ValueError as error:
             skipped[name] = str(error)
+    if not usable:
+        reasons = "; ".join(f"{name}: {why}" for name, why in skipped.items())
+        raise InputError(f"{sequence.name}: no method can run: {reasons}")
     return usable, skipped, left_out
+
+
+def _window_length(method: Method) -> int:
+    """How many frames in a row a method's window has, the held-back one included."""
+    return 2 * method.past + max(0, 2 * method.future - 1)
+
+
+def _costs(sequence: Sequence, methods: dict[str, Method]) -> list[str]:
+    """For methods that need more frames around a held-back one than the others: how many scored frames that costs."""
+
+    def count(chosen: dict[str, Method]) -> int:
+        past, future = max(m.past for m in chosen.values()), max(m.future for m in chosen.values())
+        return len(held_back(sequence, past=past, future=future))
+
+    notes, all_of_them = [], count(methods)
+    for what, need in (("before", lambda m: m.past), ("after", lambda m: m.future)):
+        most = max(need(m) for m in methods.values())
+        demanding = [name for name, m in methods.items() if need(m) == most]
+        others = {name: m for name, m in methods.items() if name not in demanding}
+        cost = count(others) - all_of_them if others else 0
+        if cost:
+            names = f"{', '.join(demanding)} need{'s' if len(demanding) == 1 else ''}"
+            notes.append(
+                f"{names} {most} rendered frame{'s' if most > 1 else ''} {what} a held-back one: {all_of_them} frames "
+                f"can be scored; without {'it' if len(demanding) == 1 else 'them'} there are {cost} more"
+            )
+    return notes
 
 
 def _chosen(numbers: list[int], frames: str | None, sequence: Sequence, past: int) -> list[int]:
@@ -273,12 +400,11 @@ def _score_window(sequence, window: Window, methods, compile_ms, metrics) -> dic
 
 
 def _score_clips(
-    sequence, methods, numbers, metrics, kept: Kept, step: Step, *, past, future
+    sequence, methods, numbers, metrics, kept: Scores, step: Step, *, past, future
 ) -> tuple[dict, list[str]]:
     """The metrics of clips, over the held-back frames one after the other; and why some could not be had."""
     wanted = [m for m in metrics.values() if m.per == "clip"]
-    key = f"clip-{zlib.crc32(repr(numbers).encode()):08x}"
-    found: dict[str, dict[str, float]] = kept.read(key) or {}
+    found = kept.clips(numbers)
     notes: dict[str, str] = {}
 
     def clip(method: Method | None) -> Iterator[Any]:
@@ -295,7 +421,7 @@ def _score_clips(
                 found.setdefault(name, {})[metric.name] = metric(clip(method), clip(None))
             except (ValueError, RuntimeError) as error:
                 notes[metric.name] = f"{metric.name}: {error}"
-            kept.write(key, found)
+            kept.write_clips(numbers, found)
     return found, list(notes.values())
 
 

@@ -1,29 +1,33 @@
 """`jaxtrapolate generate`: make the frames between the rendered ones."""
 
 import argparse
-import json
-from collections.abc import Iterator
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxtrapolate import __version__
+from jaxtrapolate._version import __version__
 from jaxtrapolate.commands.inputs import (
+    add_fresh,
     add_input,
     add_weights,
     open_input,
     open_methods,
-    output_folder,
     progress,
     terminal,
 )
 from jaxtrapolate.files import InputError, Sequence, runs, write_frame
-from jaxtrapolate.files.atomic import atomic_path
-from jaxtrapolate.forecast import forecast
+from jaxtrapolate.files.reader import stored_size
+from jaxtrapolate.frame_forecast import forecast
 from jaxtrapolate.methods.method import Frames, Method, rendered
+from jaxtrapolate.output import open_output, write_json
 from jaxtrapolate.records import Frame, replace
+from jaxtrapolate.weights import fingerprint
 
 
 def add_parser(subparsers: Any) -> None:
@@ -39,57 +43,99 @@ def add_parser(subparsers: Any) -> None:
     add_weights(parser)
     parser.add_argument("--output", required=True, metavar="DIR", help="for the frames: EXR for HDR input, else PNG")
     parser.add_argument("--factor", type=int, default=2, metavar="N", help="frame rate out over frame rate in (2)")
+    add_fresh(parser)
     parser.set_defaults(run=run)
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """A frame to be made.
+
+    Attributes:
+        name: of its file, without the ending.
+        numbers: of the frames of the input that it is made from.
+        given: history, target and future for the method, or why it cannot have them.
+    """
+
+    name: str
+    numbers: tuple[int, ...]
+    given: Callable[[], tuple[Frames, Frame, Frames] | str]
 
 
 def run(options: argparse.Namespace) -> None:
     """Runs the command."""
     console = terminal(stderr=True)
-    if options.factor < 2:
-        raise InputError(f"--factor: expected 2 or more, got {options.factor}")
+    if options.factor < 2 or options.factor > 1000:
+        raise InputError(f"--factor: expected 2 to 1000, got {options.factor}")
     method = _one(*open_methods(options.method, option="--method", weights=options.weights))
     sequence = open_input(options.input, motion=options.motion, strict=options.strict)
-    folder = output_folder(options.output)
     missing = [n for n in sequence.numbers if not sequence.has_color(n)]
     if missing:
-        jobs, count, how = list(_missing(sequence, method, missing)), len(missing), "from the buffers drawn for them"
+        jobs, how = list(_missing(sequence, method, missing)), "from the buffers drawn for them"
     elif method.kind == "interpolation":
-        steps = sum(len(r) - 1 for r in runs(sequence))
-        jobs, count = _between(sequence, method, options.factor), steps * (options.factor - 1)
-        how = "between each two rendered frames"
+        jobs, how = list(_between(sequence, method, options.factor)), "between each two rendered frames"
     else:
-        jobs, count = _onward(sequence, method, options.factor), len(sequence.numbers) * (options.factor - 1)
+        jobs = list(_onward(sequence, method, options.factor))
         how = "after each rendered frame, by its motion carried on: no buffers were drawn for them"
-    made, kept, skipped = 0, 0, 0
-    suffix = ".exr" if sequence.hdr else ".png"
-    with progress(console) as bar:
-        for name, given in bar.track(jobs, total=count, description="generate"):
-            path = folder / f"{name}{suffix}"
-            if path.exists():
-                kept += 1
-                continue
-            frames = given()
-            if frames is None:
-                skipped += 1
-                continue
-            write_frame(path, np.asarray(method(*frames)), sequence.hdr)
-            made += 1
-    summary = {
-        "version": __version__,
-        "input": sequence.name,
+    settings = {
+        **sequence.identity(),
         "method": method.name,
-        "frames": count,
-        "made": made,
-        "kept from an earlier run": kept,
-        "without history": skipped,
-        "how": how,
+        "weights": fingerprint(method.state) if jax.tree.leaves(method.state) else None,
+        "factor": None if missing else options.factor,
     }
-    with atomic_path(folder / "generate.json") as temporary:
-        temporary.write_text(json.dumps(summary, indent=1))
-    text = f"{made} frames made with {method.name}, {how}; in {folder}"
+    with open_output(options.output, "generate", settings, fresh=options.fresh) as output:
+        suffix = ".exr" if sequence.hdr else ".png"
+        made, kept, reasons = 0, 0, dict[str, int]()
+        with progress(console) as bar:
+            hashing = bar.add_task("read input", total=None)
+            output.agree_frames(
+                sequence,
+                sorted({n for job in jobs for n in job.numbers}),
+                step=lambda text, done, total: bar.update(hashing, completed=done, total=total),
+            )
+            bar.remove_task(hashing)
+            for job in bar.track(jobs, description="generate"):
+                path = output.folder / f"{job.name}{suffix}"
+                if _whole(path, sequence.size, method.scale):
+                    kept += 1
+                    continue
+                given = job.given()
+                if isinstance(given, str):
+                    reasons[given] = reasons.get(given, 0) + 1
+                    continue
+                write_frame(path, np.asarray(method(*given)), sequence.hdr)
+                made += 1
+        if not made + kept:
+            causes = "; ".join(f"{count}: {reason}" for reason, count in reasons.items())
+            raise InputError(f"{sequence.name}: no frame can be made with {method.name} ({causes or 'too few frames'})")
+        summary = {
+            "version": __version__,
+            "input": sequence.name,
+            "method": method.name,
+            "frames": len(jobs),
+            "made": made,
+            "kept from an earlier run": kept,
+            "left out": reasons,
+            "how": how,
+            "notes": list(sequence.notes),
+        }
+        write_json(output.folder / "generate.json", summary)
+    text = f"{made} frames made with {method.name}, {how}; in {output.folder}"
     text += f"; {kept} were there already" if kept else ""
-    text += f"; {skipped} left out, with too little history" if skipped else ""
+    text += "".join(f"; {count} left out: {reason}" for reason, count in reasons.items())
     console.print(text, soft_wrap=True, highlight=False)
+    for note in sequence.notes:
+        console.print(f"note: {note}", soft_wrap=True, highlight=False)
+
+
+def _whole(path: Path, size: tuple[int, int], scale: int) -> bool:
+    """Whether a frame's file is there, in full and of the right size."""
+    if not path.is_file():
+        return False
+    try:
+        return stored_size(path) == (size[0] * scale, size[1] * scale)
+    except InputError:
+        return False
 
 
 def _one(methods: dict[str, Method], unavailable: dict[str, str]) -> Method:
@@ -100,77 +146,106 @@ def _one(methods: dict[str, Method], unavailable: dict[str, str]) -> Method:
     return next(iter(methods.values()))
 
 
-def _history(sequence: Sequence, number: int, method: Method) -> Frames:
-    """The frames before `number` without a gap, back to as many rendered ones as the method wants."""
-    (run,) = (r for r in runs(sequence) if number in r)
-    frames: list[Frame] = []
-    for i in range(number - 1, run[0] - 1, -1):
-        frames.insert(0, sequence.frame(i))
-        if len(rendered(frames)) == method.past:
+NO_HISTORY = "too little history: rendered frames before them, without a gap"
+NO_FUTURE = "no rendered frame follows them without a gap"
+
+
+def _run_of(sequence: Sequence, number: int) -> range:
+    """The frames without a gap that a frame belongs to."""
+    return next(r for r in runs(sequence) if number in r)
+
+
+def _before(sequence: Sequence, number: int, past: int) -> tuple[int, ...]:
+    """The frames before `number` without a gap, back to the `past`-th rendered one or the oldest there is."""
+    found: list[int] = []
+    count = 0
+    run = _run_of(sequence, number)
+    for n in reversed(run[: run.index(number)]):
+        found.insert(0, n)
+        count += sequence.has_color(n)
+        if count == past:
             break
-    while frames and frames[0].color is None:
-        frames.pop(0)
-    return tuple(frames)
+    while found and not sequence.has_color(found[0]):
+        found.pop(0)
+    return tuple(found)
 
 
-def _usable(method: Method, history: Frames, target: Frame, future: Frames = ()):
-    """History, target and future, `None` where the method cannot start yet; raises where it never can."""
+def _behind(sequence: Sequence, number: int, future: int) -> tuple[int, ...]:
+    """The frames after `number` without a gap, up to the `future`-th rendered one; none where there are fewer.
+
+    All of them, those without colour too: motion vectors lead from frame to frame.
+    """
+    found: list[int] = []
+    count = 0
+    run = _run_of(sequence, number)
+    for n in run[run.index(number) + 1 :] if future else ():
+        found.append(n)
+        count += sequence.has_color(n)
+        if count == future:
+            return tuple(found)
+    return ()
+
+
+def _frames(sequence: Sequence, numbers: tuple[int, ...]) -> Frames:
+    return tuple(sequence.frame(n) for n in numbers)
+
+
+def _usable(method: Method, history: Frames, target: Frame, future: Frames = ()) -> tuple[Frames, Frame, Frames] | str:
+    """History, target and future, or why the method cannot start yet; raises where it never can."""
     if not rendered(history):
-        return None
+        return NO_HISTORY
     try:
         method.active(history, target, future)
     except ValueError as error:
         if "rendered frames in history" in str(error):
-            return None
+            return NO_HISTORY
         raise InputError(str(error)) from None
     return history, target, future
 
 
-def _missing(sequence: Sequence, method: Method, numbers: list[int]) -> Iterator[tuple[str, Any]]:
+def _missing(sequence: Sequence, method: Method, numbers: list[int]) -> Iterator[Job]:
     """The frames that have buffers but no colour."""
     for number in numbers:
+        before, behind = _before(sequence, number, method.past), _behind(sequence, number, method.future)
 
-        def given(number=number):
-            future: Frames = ()
-            if method.future:
-                later = [n for n in sequence.numbers if n > number and sequence.has_color(n)]
-                future = tuple(sequence.frame(n) for n in later[: method.future])
-            return _usable(method, _history(sequence, number, method), sequence.frame(number), future)
+        def given(number=number, before=before, behind=behind):
+            if method.future and not behind:
+                return NO_FUTURE
+            frames = _frames(sequence, before), sequence.frame(number), _frames(sequence, behind)
+            return _usable(method, *frames)
 
-        yield f"{number:04d}", given
+        yield Job(f"{number:04d}", (*before, number, *behind), given)
 
 
-def _between(sequence: Sequence, method: Method, factor: int) -> Iterator[tuple[str, Any]]:
+def _between(sequence: Sequence, method: Method, factor: int) -> Iterator[Job]:
     """factor - 1 frames between each two."""
     for run in runs(sequence):
-        for number in run[:-1]:
+        for number, following in itertools.pairwise(run):
+            before = (*_before(sequence, number, method.past - 1), number) if method.past > 1 else (number,)
             for k in range(1, factor):
 
-                def given(number=number, k=k):
-                    following = sequence.frame(number + 1)
-                    target = Frame(time=number + k / factor)
-                    history = (*_history(sequence, number, method), replace(sequence.frame(number), time=float(number)))
-                    future = (replace(following, time=float(number + 1)),)
-                    return _usable(method, history[-max(1, 2 * method.past - 1) :], target, future)
+                def given(before=before, number=number, following=following, k=k):
+                    target = Frame(time=number + (following - number) * k / factor)
+                    later = replace(sequence.frame(following), time=float(following))
+                    history = tuple(replace(sequence.frame(n), time=float(n)) for n in before)
+                    return _usable(method, history, target, (later,))
 
-                yield _name(number, k, factor), given
+                yield Job(_name(number, k, factor), (*before, following), given)
 
 
-def _onward(sequence: Sequence, method: Method, factor: int) -> Iterator[tuple[str, Any]]:
+def _onward(sequence: Sequence, method: Method, factor: int) -> Iterator[Job]:
     """factor - 1 frames after each, as if its motion went on."""
     for number in sequence.numbers:
+        before = (*_before(sequence, number, method.past - 1), number) if method.past > 1 else (number,)
         for k in range(1, factor):
 
-            def given(number=number, k=k):
-                newest = sequence.frame(number)
+            def given(before=before, number=number, k=k):
+                *older, newest = _frames(sequence, before)
                 if newest.motion is None:
                     raise InputError(f"{sequence.name}: frame {number} has no motion vectors to carry on")
-                history = (*_history(sequence, number, method), newest)
-                while len(rendered(history)) > method.past:
-                    history = history[1:]
-                return _usable(method, history, jax.device_get(forecast(newest, k / factor)))
+                return _usable(method, (*older, newest), jax.device_get(forecast(newest, k / factor)))
 
-            yield _name(number, k, factor), given
+            yield Job(_name(number, k, factor), before, given)
 
 
 def _name(number: int, k: int, factor: int) -> str:

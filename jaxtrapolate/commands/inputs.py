@@ -84,9 +84,7 @@ def named_inputs(
     if size is not None:
         scenes["size"] = parse_size(size)
     if length is not None:
-        if length < 1:
-            raise InputError(f"--length: expected 1 or more, got {length}")
-        scenes["frames"] = length
+        scenes["frames"] = check_count("--length", length)
     if scenes and not any(t.startswith(SCENES) for t in texts):
         raise InputError(f"--size, --length: are for embedded scenes ({SCENES}NAME); a folder has its own")
     found: dict[object, Input] = {}
@@ -96,10 +94,18 @@ def named_inputs(
                 key = f"{name}-{seed}"
                 found.setdefault((SCENES, key), Input(f"{SCENES}{name}:{seed}", key, _scene(name, seed, scenes)))
         else:
-            place = Path(text).resolve()
-            name = place.parent.name if place.suffix == ".toml" else place.name
-            found.setdefault(place, Input(text, name, _folder(text, motion, strict)))
+            path = _resolved(text)
+            folder = path.parent if path.suffix == ".toml" else path
+            found.setdefault(path, Input(text, "/".join(folder.parts[1:]), _folder(text, motion, strict)))
     return _named_apart(list(found.values()))
+
+
+def _resolved(text: str) -> Path:
+    """The path without symbolic links, wherever they lead."""
+    try:
+        return Path(os.path.realpath(text, strict=os.path.lexists(text)))
+    except (OSError, ValueError) as error:
+        raise os_input_error(text, error if isinstance(error, OSError) else OSError(str(error))) from error
 
 
 def _scenes(text: str) -> list[tuple[str, str]]:
@@ -119,9 +125,9 @@ def _scene(name: str, seed: str, options: dict) -> Callable[[], Sequence]:
 
         if name not in scene_names():
             raise InputError(f"{SCENES}{name}: no such scene; the embedded ones are {', '.join(scene_names())}")
-        if not re.fullmatch("[0-9]+", seed):
+        if not re.fullmatch("[0-9]{1,19}", seed):
             raise InputError(f"{SCENES}{name}:{seed}: expected a seed of digits, such as {SCENES}{name}:0")
-        return SceneSequence(name, int(seed), **options)
+        return SceneSequence(name, check_seed(f"{SCENES}{name}:SEED", int(seed)), **options)
 
     return opened
 
@@ -131,25 +137,62 @@ def _folder(text: str, motion: str | None, strict: bool) -> Callable[[], Sequenc
 
 
 def _named_apart(inputs: list[Input]) -> list[Input]:
-    """The inputs with names that are fit for folders and told apart by a number: clip, clip-2."""
-    taken: set[str] = set()
-    result = []
+    """The inputs with names fit for folders: the last parts of their paths, as many as tell them all apart.
+
+    Where only characters that no folder should have tell two apart, a number does: clip, clip-2.
+    """
+
+    def ends(entry: Input, count: int) -> str:
+        parts = [re.sub(r"[^\w.-]+", "_", part).strip(".") for part in entry.name.split("/")[-count:]]
+        return "-".join(filter(None, parts)) or "input"
+
+    deepest = max((entry.name.count("/") + 1 for entry in inputs), default=1)
+    names: list[str] = []
     for entry in inputs:
-        plain = re.sub(r"[^\w.-]+", "_", entry.name).strip(".") or "input"
-        name = next(
-            n for i in range(1, len(inputs) + 2) if (n := plain if i == 1 else f"{plain}-{i}").lower() not in taken
-        )
+        others = [other for other in inputs if other is not entry]
+        counts = range(1, deepest + 1)
+        apart = (n for n in counts if all(ends(entry, n).lower() != ends(other, n).lower() for other in others))
+        names.append(ends(entry, next(apart, 1)))
+    result, taken = [], set()
+    for entry, plain in zip(inputs, names, strict=True):
+        tries = (plain if i == 1 else f"{plain}-{i}" for i in range(1, len(inputs) + 2))
+        name = next(n for n in tries if n.lower() not in taken)
         taken.add(name.lower())
         result.append(dataclasses.replace(entry, name=name))
     return result
 
 
+MOST_FRAMES, LARGEST_SIDE, MOST_PIXELS = 1_000_000, 32768, 1 << 28
+"""Of embedded scenes: far beyond what can be rendered, and short of what overflows."""
+
+
+def check_count(option: str, value: int) -> int:
+    """A number of frames, at least 1."""
+    if not 1 <= value <= MOST_FRAMES:
+        raise InputError(f"{option}: expected a number from 1 to {MOST_FRAMES}, got {value}")
+    return value
+
+
 def parse_size(text: str) -> tuple[int, int]:
     """(H, W) from "WxH"."""
-    match = re.fullmatch(r"(\d+)x(\d+)", text)
-    if not match or min(int(g) for g in match.groups()) < 1:
-        raise InputError(f"--size: expected WxH such as 320x180, got {text!r}")
-    return int(match[2]), int(match[1])
+    match = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)
+    width, height = (int(g) for g in match.groups()) if match else (0, 0)
+    if min(width, height) < 1 or max(width, height) > LARGEST_SIDE or width * height > MOST_PIXELS:
+        most = f"sides of at most {LARGEST_SIDE} and {MOST_PIXELS} pixels"
+        raise InputError(f"--size: expected WxH such as 320x180, with {most}, got {text!r}")
+    return height, width
+
+
+def check_seed(option: str, value: int) -> int:
+    """A scene's seed, not negative."""
+    if not 0 <= value < 2**63:
+        raise InputError(f"{option}: expected a number from 0 to {2**63 - 1}, got {value}")
+    return value
+
+
+def add_fresh(parser: argparse.ArgumentParser) -> None:
+    """The argument that starts anew in a folder of another run."""
+    parser.add_argument("--fresh", action="store_true", help="delete what an earlier run wrote to DIR, and start anew")
 
 
 def add_weights(parser: argparse.ArgumentParser) -> None:
@@ -234,18 +277,6 @@ def open_metrics(names: str) -> dict[str, Metric]:
     if not found:
         raise InputError(f"--metrics: expected names separated by commas, of {', '.join(metric_names())}")
     return found
-
-
-def output_folder(text: str) -> Path:
-    """An output folder, made if need be, that can be written to."""
-    folder = Path(text)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise os_input_error(folder, error, action="write") from error
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise InputError(f"{folder}: no permission to write there; change its permissions or choose another place")
-    return folder
 
 
 def terminal(*, stderr: bool = False) -> Console:

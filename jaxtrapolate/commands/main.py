@@ -1,17 +1,21 @@
 """The command line: `jaxtrapolate COMMAND`."""
 
 import argparse
+import contextlib
+import errno
+import os
+import signal
 import sys
 from collections.abc import Sequence
 
-from jaxtrapolate import __version__
-from jaxtrapolate.commands import check, demo, evaluate, generate, import_weights, render, scenes, train
-from jaxtrapolate.files import InputError
-from jaxtrapolate.memory import keep_memory
+from jaxtrapolate._version import __version__
+from jaxtrapolate.commands import interrupt
 
 
 def parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
+    from jaxtrapolate.commands import check, demo, evaluate, generate, import_weights, render, scenes, train
+
     top = argparse.ArgumentParser(
         prog="jaxtrapolate",
         description="Make the frames between rendered frames, and say how good and how fast that is.",
@@ -24,20 +28,62 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a command; 0, or 2 after one line on stderr about input that cannot be used."""
+    """Runs a command; 0, or 2 after one line on stderr about input that cannot be used, 130 after Ctrl-C."""
+    try:
+        with interrupt.interruptible():
+            return _run(arguments)
+    except KeyboardInterrupt:
+        print(interrupt.MESSAGE, file=sys.stderr)
+        return interrupt.STATUS
+
+
+def _run(arguments: Sequence[str] | None) -> int:
+    # imported here: an interrupt while JAX is being imported is one like any other
+    from jaxtrapolate.files import InputError
+    from jaxtrapolate.files.atomic import known_os_error, os_input_error
+    from jaxtrapolate.memory import keep_memory
+
     options = parser().parse_args(arguments)
     keep_memory()
     try:
-        return options.run(options) or 0
+        status = options.run(options) or 0
+        sys.stdout.flush()
+        return status
     except InputError as error:
-        print(f"jaxtrapolate: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("jaxtrapolate: interrupted; run again to go on", file=sys.stderr)
-        return 130
+        return _fail(str(error))
     except BrokenPipeError:
+        _give_up_stdout()
         return 141
+    except OSError as error:
+        if not known_os_error(error):
+            raise
+        if error.filename is None and error.errno == errno.ENOSPC:
+            _give_up_stdout()
+        return _fail(str(os_input_error(error.filename or "standard output", error, action="write")))
+
+
+def _fail(text: str) -> int:
+    line = " ".join(text.split())
+    # a path need not be text in the terminal's encoding
+    encoding = sys.stderr.encoding or "utf-8"
+    print(f"jaxtrapolate: {line}".encode(encoding, "backslashreplace").decode(encoding), file=sys.stderr)
+    return 2
+
+
+def _give_up_stdout() -> None:
+    """What is still to be written goes nowhere, so that Python does not complain of it at its end."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def script() -> int:
+    """As `main`, for a process of its own: after the command an interrupt just ends it."""
+    status = main()
+    with contextlib.suppress(OSError):
+        sys.stderr.flush()
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    return status
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(script())

@@ -4,16 +4,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxtrapolate.commands.inputs import Input, Step, output_folder
-from jaxtrapolate.commands.kept import write_json
+from jaxtrapolate.commands.inputs import Input, Step
 from jaxtrapolate.evaluation import mean_over_inputs
 from jaxtrapolate.files import InputError
+from jaxtrapolate.output import open_output, write_json
 from jaxtrapolate.report import write_report
 from jaxtrapolate.timing import machine
 
 
 def evaluate_many(
-    inputs: list[Input], evaluate: Callable[..., dict[str, Any]], folder: Path, *, step: Step
+    inputs: list[Input], evaluate: Callable[..., dict[str, Any]], folder: Path, *, fresh: bool = False, step: Step
 ) -> tuple[dict[str, Any] | None, dict[str, str]]:
     """Evaluates inputs one after the other, and writes what they have in common to `folder`.
 
@@ -22,12 +22,27 @@ def evaluate_many(
         evaluate: of a sequence, with `folder`, `reuse` and `step`.
         folder: gets a folder for each input, with its own results.json and report.html. An input that an earlier run
             finished is not run again.
+        fresh: delete the results over all inputs of an earlier run (`evaluate` does that of each input's).
         step: told how many inputs are done, with fractions.
 
     Returns:
         The results over all inputs, None where none could be used; and, by argument, why an input could not be used,
         which starts with its name.
     """
+    with open_output(folder, "evaluate", {"inputs": "several"}, fresh=fresh):
+        done, failed = _each(inputs, evaluate, folder, step)
+        if not done:
+            return None, failed
+        results = over_all(list(done.values()), failed)
+        write_json(folder / "results.json", results)
+        write_report(results, folder)
+    return results, failed
+
+
+def _each(
+    inputs: list[Input], evaluate: Callable[..., dict[str, Any]], folder: Path, step: Step
+) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    """What the results of all inputs say about each, by name, and why the others could not be used, by argument."""
     done: dict[str, dict[str, Any]] = {}
     failed: dict[str, str] = {}
     for index, entry in enumerate(inputs):
@@ -40,19 +55,14 @@ def evaluate_many(
 
         try:
             follow("read", 0, 1)
-            results = evaluate(entry.open(), folder=output_folder(str(folder / entry.name)), reuse=True, step=follow)
+            results = evaluate(entry.open(), folder=folder / entry.name, reuse=True, step=follow)
             done[entry.name] = _entry(entry.name, results)
         except InputError as error:
             reason = " ".join(str(error).split())
             failed[entry.text] = (
                 reason if reason.startswith(entry.text.removesuffix(":0")) else f"{entry.text}: {reason}"
             )
-    if not done:
-        return None, failed
-    results = over_all(list(done.values()), failed)
-    write_json(folder / "results.json", results)
-    write_report(results, folder)
-    return results, failed
+    return done, failed
 
 
 def _entry(name: str, results: dict[str, Any]) -> dict[str, Any]:
@@ -68,7 +78,8 @@ def _entry(name: str, results: dict[str, Any]) -> dict[str, Any]:
 def over_all(inputs: list[dict[str, Any]], failed: dict[str, str]) -> dict[str, Any]:
     """The results over all inputs: their table, and for each method the means of `mean_over_inputs`."""
     first = inputs[0]
-    settings = {k: first["settings"][k] for k in ("version", "methods", "metrics", "frames", "pictures", "video")}
+    common = ("version", "code", "methods", "metrics", "frames", "pictures", "video")
+    settings = {k: first["settings"][k] for k in common}
     methods = mean_over_inputs([i["methods"] for i in inputs], metrics=first["metrics"])
     in_order = [name for name in settings["methods"] if name in methods]
     skipped = {}

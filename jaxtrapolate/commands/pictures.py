@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.commands.inputs import output_folder
 from jaxtrapolate.evaluation import Window, arguments, causes_of, display
 from jaxtrapolate.files import Sequence, write_png
 from jaxtrapolate.holes import hole_masks
 from jaxtrapolate.methods import Method
+from jaxtrapolate.output import writable_folder
 from jaxtrapolate.records import CHANNELS, GBuffer
 from jaxtrapolate.report import colorize_causes, colorize_error
 
@@ -56,7 +56,7 @@ def motion_picture(motion: Any) -> np.ndarray:
 
 def write_pictures(sequence: Sequence, window: Window, methods: dict[str, Method], folder: Path) -> dict[str, Any]:
     """Writes the pictures of a window below `folder/pictures`; returns their paths, relative to `folder`."""
-    place = output_folder(str(folder / "pictures" / f"{window.number:04d}"))
+    place = writable_folder(folder / "pictures" / f"{window.number:04d}")
 
     def put(name: str, codes: np.ndarray) -> str:
         write_png(place / f"{name}.png", codes)

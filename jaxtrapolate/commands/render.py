@@ -1,10 +1,14 @@
 """`jaxtrapolate render`: an embedded scene as an Unreal-style EXR dump."""
 
 import argparse
+from pathlib import Path
 from typing import Any
 
-from jaxtrapolate.commands.inputs import output_folder, parse_size, progress, terminal
+from jaxtrapolate.commands.inputs import add_fresh, check_count, check_seed, parse_size, progress, terminal
 from jaxtrapolate.files import InputError, write_unreal_frame
+from jaxtrapolate.files.reader import BUFFERS, stored_size
+from jaxtrapolate.files.unreal import NAMES
+from jaxtrapolate.output import open_output
 
 
 def add_parser(subparsers: Any) -> None:
@@ -19,6 +23,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--size", default="320x180", metavar="WxH", help="width and height in pixels (320x180)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="varies layout, colours, speeds (0)")
     parser.add_argument("--output", required=True, metavar="DIR", help="for the EXR files")
+    add_fresh(parser)
     parser.set_defaults(run=run)
 
 
@@ -27,18 +32,30 @@ def run(options: argparse.Namespace) -> None:
     from jaxtrapolate.scenes import SceneSequence, scene_names
 
     size = parse_size(options.size)
-    if options.frames < 1:
-        raise InputError(f"--frames: expected 1 or more, got {options.frames}")
+    frames, seed = check_count("--frames", options.frames), check_seed("--seed", options.seed)
     if options.scene not in scene_names():
         raise InputError(f"no scene {options.scene!r}; the embedded ones are {', '.join(scene_names())}")
-    folder = output_folder(options.output)
-    sequence = SceneSequence(options.scene, seed=options.seed, frames=options.frames, size=size)
+    sequence = SceneSequence(options.scene, seed=seed, frames=frames, size=size)
     console = terminal(stderr=True)
-    name = options.scene.title()
-    with progress(console) as bar:
+    name, kept = options.scene.title(), 0
+    with (
+        open_output(options.output, "render", sequence.identity(), fresh=options.fresh) as output,
+        progress(console) as bar,
+    ):
         for number in bar.track(sequence.numbers, description="render"):
-            if (folder / f"{name}BackwardFlow.{number:04d}.exr").exists():
-                continue  # the last file of a frame: an earlier run wrote it
+            if _whole(output.folder, name, number, size):
+                kept += 1
+                continue
             frame, flows = sequence.frame(number), sequence.keyframe(number)
-            write_unreal_frame(folder, name, number, frame, keyframe=flows, unit=100.0)
-    console.print(f"{len(sequence.numbers)} frames of {options.scene} in {folder}", soft_wrap=True, highlight=False)
+            write_unreal_frame(output.folder, name, number, frame, keyframe=flows, unit=100.0)
+    text = f"{frames} frames of {options.scene} in {options.output}" + (f"; {kept} were there already" if kept else "")
+    console.print(text, soft_wrap=True, highlight=False)
+
+
+def _whole(folder: Path, scene: str, number: int, size: tuple[int, int]) -> bool:
+    """Whether all files of a frame are there, in full; the sky is told by the normals and has none."""
+    try:
+        paths = (folder / f"{scene}{NAMES[buffer]}.{number:04d}.exr" for buffer in BUFFERS if buffer != "sky")
+        return all(path.is_file() and stored_size(path) == size for path in paths)
+    except InputError:
+        return False

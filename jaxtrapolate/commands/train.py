@@ -5,7 +5,7 @@ import sys
 import tomllib
 from typing import Any
 
-from jaxtrapolate.commands.inputs import output_folder, steps, terminal
+from jaxtrapolate.commands.inputs import add_fresh, steps, terminal
 from jaxtrapolate.files import InputError
 
 
@@ -35,6 +35,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--coordinator", metavar="HOST:PORT", help="over several hosts: where the first can be reached")
     parser.add_argument("--processes", type=int, metavar="N", help="with --coordinator: how many there are")
     parser.add_argument("--process", type=int, metavar="I", help="with --coordinator: which this one is, from 0 on")
+    add_fresh(parser)
     parser.set_defaults(run=run)
 
 
@@ -45,15 +46,16 @@ def run(options: argparse.Namespace) -> int:
 
     console = terminal(stderr=True)
     config = load_config(options.config, dict(map(_setting, options.set)))
-    folder = output_folder(options.workdir)
     try:
         with steps(console) as report:
-            scores = train_and_evaluate(config, folder, report=report)
+            scores = train_and_evaluate(config, options.workdir, report=report, fresh=options.fresh)
     except TrainingError as error:
         print(f"jaxtrapolate: {error}", file=sys.stderr)
         return 1
     text = ", ".join(f"{name} {value:.4g}" for name, value in scores.items() if value is not None)
-    console.print(f"{config.steps} steps of {config.task}: {text}; in {folder}", soft_wrap=True, highlight=False)
+    console.print(
+        f"{config.steps} steps of {config.task}: {text}; in {options.workdir}", soft_wrap=True, highlight=False
+    )
     return 0
 
 

@@ -10,11 +10,12 @@ import numpy as np
 from PIL import Image
 
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.commands.inputs import Step, output_folder
+from jaxtrapolate.commands.inputs import Step
 from jaxtrapolate.commands.pictures import eight_bit
 from jaxtrapolate.evaluation import arguments, display, windows
 from jaxtrapolate.files import InputError, Sequence
 from jaxtrapolate.methods import Method
+from jaxtrapolate.output import writable_folder
 from jaxtrapolate.report import VIDEO_FORMATS, check_video_format, side_by_side, write_video
 
 
@@ -58,7 +59,7 @@ class Video:
             raise InputError(f"--video: {error}") from None
         if not named and several:
             raise InputError(f"--video: several inputs have one each in their folders; give {', '.join(VIDEO_FORMATS)}")
-        return cls(path if named else output_folder(str(path.parent)).resolve() / path.name, fps)
+        return cls(path if named else writable_folder(path.parent).resolve() / path.name, fps)
 
     def write(
         self,

@@ -5,7 +5,9 @@ A further reader is one file with one subclass of `Sequence`, named in `jaxtrapo
 
 import abc
 import dataclasses
-from typing import Literal, get_args
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -79,6 +81,14 @@ class Sequence(abc.ABC):
 
         Non-finite pixels have been replaced as `jaxtrapolate.files.repair` says.
         """
+
+    def files(self, number: int) -> Mapping[str, Path]:
+        """The file of each stored buffer of a frame; none where frames are not read from files."""
+        return {}
+
+    def identity(self) -> dict[str, Any]:
+        """What, besides the content of files, decides about what frames hold; what JSON holds, the same in a copy."""
+        return {"size": list(self.size), "hdr": self.hdr, "depth": self.depth, "motion": str(self.convention)}
 
     def has_color(self, number: int) -> bool:
         """Whether the frame has colour, without reading it."""

@@ -1,5 +1,7 @@
 """A scene as a `Sequence`, the interface that commands and methods read."""
 
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -42,6 +44,10 @@ class SceneSequence(Sequence):
         self.depth = "metric"
         self.forward_motion = True
         self.samples = samples
+
+    def identity(self) -> dict[str, Any]:
+        """The scene, its seed and the samples a pixel, beside what all sequences have."""
+        return super().identity() | {"scene": self.name, "samples": self.samples}
 
     def frame(self, number: int) -> Frame:
         """The frame with every buffer."""

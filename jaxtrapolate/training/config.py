@@ -13,7 +13,6 @@ A file holds the fields of `Config`; the table `[options]` those of the task's o
 """
 
 import dataclasses
-import json
 import os
 import tomllib
 import types
@@ -24,7 +23,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from jaxtrapolate.files import InputError
-from jaxtrapolate.files.atomic import atomic_path, os_input_error
+from jaxtrapolate.files.atomic import os_input_error
 from jaxtrapolate.training.tasks import Task, find_task
 
 T = TypeVar("T")
@@ -267,46 +266,3 @@ def _shipped() -> dict[str, Any]:
 def make_task(config: Config) -> Task:
     """The task of a configuration."""
     return find_task(config.task).make(config.options)
-
-
-def keep_config(config: Config, path: Path, *, write: bool = True) -> None:
-    """Writes a configuration as JSON where there is none; otherwise checks that it is the same.
-
-    Args:
-        config: of this run.
-        path: of the file.
-        write: False = only check.
-
-    Raises:
-        InputError: the file's differs; the fields are named.
-    """
-    new = dataclasses.asdict(config)
-    try:
-        old = json.loads(path.read_text()) if path.exists() else None
-    except OSError as error:
-        raise os_input_error(path, error) from error
-    except ValueError as error:
-        raise InputError(f"{path}: no JSON ({error}); choose another workdir") from error
-    if old is not None:
-        if changes := differences(old, new):
-            raise InputError(f"{path.parent}: holds a run of another configuration: {changes}; choose another workdir")
-    elif write:
-        with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(new, indent=1))
-
-
-def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """What differs between two nested tables that JSON can hold, by the names of their entries; empty if nothing."""
-    before, after = (_flat(json.loads(json.dumps(table))) for table in (old, new))
-    differ = [k for k in {**before, **after} if before.get(k) != after.get(k)]
-    return "; ".join(f"{k} was {_show(before, k)}, is now {_show(after, k)}" for k in differ)
-
-
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    if not isinstance(value, dict):
-        return {prefix: value}
-    return {k: v for key, sub in value.items() for k, v in _flat(sub, f"{prefix}.{key}" if prefix else key).items()}
-
-
-def _show(table: dict[str, Any], key: str) -> str:
-    return json.dumps(table[key]) if key in table else "not there"

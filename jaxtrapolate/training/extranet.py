@@ -87,6 +87,7 @@ class ExtraNetTask:
         self._stages = extranet(ExtraNet(options.network, rngs=nnx.Rngs(0)), preparation=options.preparation)
         self._windows = Windows(options.windows, self._prepare, past=self._stages.past)
         self._windows.check_sizes()
+        self.sequences = self._windows.sequences
         self._held: Example | None = None
         config = extranet_config(options.network, options.preparation)
         scenes = ", ".join(options.windows.scenes)

@@ -62,6 +62,7 @@ class InterpolatorTask:
         self._stages = interpolator(Interpolator(options.network, rngs=nnx.Rngs(0)))
         self._windows = Windows(options.windows, self._prepare, past=1, future=1)
         self._windows.check_sizes()
+        self.sequences = self._windows.sequences
         self._held: Example | None = None
         scenes = ", ".join(options.windows.scenes)
         config = interpolator_config(options.network)

@@ -1,9 +1,12 @@
 """The training loop: `train_and_evaluate(config, workdir)`."""
 
 import concurrent.futures
+import contextlib
+import dataclasses
+import errno
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +15,10 @@ import numpy as np
 
 from jaxtrapolate.files import InputError
 from jaxtrapolate.files.atomic import os_input_error
+from jaxtrapolate.output import Output, code, differences, open_output
 from jaxtrapolate.training import devices
 from jaxtrapolate.training.checkpoints import Checkpoints, save_model
-from jaxtrapolate.training.config import Config, differences, keep_config, make_task
+from jaxtrapolate.training.config import Config, make_task
 from jaxtrapolate.training.journal import Journal, read_metrics
 from jaxtrapolate.training.step import State, Step, make_step, started
 from jaxtrapolate.training.tasks import Example, Task, round_key
@@ -35,37 +39,47 @@ def train_and_evaluate(
     task: Task | None = None,
     report: Report | None = None,
     ahead: bool | None = None,
+    fresh: bool = False,
 ) -> dict[str, float | None]:
     """Trains a network as a configuration says, from a workdir's last checkpoint on; the last validation's scores.
 
-    In the workdir: config.json; metrics.jsonl; checkpoints/, the last few and the best; images/ of each validation; at
-    the end model/, the (averaged) weights, which `jaxtrapolate.load` takes. On one CPU a run that was killed and
-    resumed gives the same numbers bit for bit. It runs on all devices of all hosts that `jax.distributed` knows; these
-    share the workdir, and losses are the same on any number of devices but for rounding. A score that is not finite is
-    None here and null in metrics.jsonl.
+    In the workdir: run.json, which holds the configuration; metrics.jsonl; checkpoints/, the last few and the best;
+    images/ of each validation; at the end model/, the (averaged) weights, which `jaxtrapolate.load` takes. On one
+    CPU a run that was killed and resumed gives the same numbers bit for bit. It runs on all devices of all hosts
+    that `jax.distributed` knows; these share the workdir, and losses are the same on any number of devices but for
+    rounding. A score that is not finite is None here and null in metrics.jsonl. A run that goes on with other code
+    of this package says so in metrics.jsonl.
 
     Args:
         config: see `Config`.
         workdir: a folder, made if need be. It holds one run.
         task: instead of the one that the configuration names.
         report: called at every line of the log.
+        fresh: delete what an earlier run wrote to the workdir, and begin anew.
         ahead: whether a thread makes the next round's pool while this one is trained on, which holds two in memory; by
             default on accelerators only, for on a CPU both want the same cores.
 
     Raises:
-        InputError: a workdir of another configuration, or that cannot be written; a batch that cannot be divided among
+        InputError: a workdir of another configuration, of frames that have changed since, in use by another run, or
+            that cannot be written (the disk is full); a batch that cannot be divided among
             the devices; weights to start from that cannot be read or do not fit.
         TrainingError: a loss or gradient that is not finite; the message names the step, and the batch is saved.
     """
     devices.check_divisible(config.batch)
-    folder = Path(workdir)
     first = jax.process_index() == 0
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise os_input_error(folder, error, action="write") from error
-    keep_config(config, folder / "config.json", write=first)
-    task = make_task(config) if task is None else task
+    settings = dataclasses.asdict(config)
+    with open_output(workdir, "train", settings, fresh=fresh, any_code=True, writes=first) as output:
+        task = make_task(config) if task is None else task
+        for index, sequence in enumerate(getattr(task, "sequences", ())):
+            output.agree_frames(sequence, sequence.numbers, kind=f"frames of dump {index}")
+        with _disk_errors(output.folder):
+            return _train(config, task, output, report, ahead=ahead, first=first)
+
+
+def _train(
+    config: Config, task: Task, output: Output, report: Report | None, *, ahead: bool | None, first: bool
+) -> dict[str, float | None]:
+    folder = output.folder
     step = make_step(task, config)
     with Checkpoints(folder / "checkpoints", keep=config.keep, score=task.score) as checkpoints:
         state, start = step.create(), checkpoints.latest() or 0
@@ -74,6 +88,8 @@ def train_and_evaluate(
         elif config.start is not None:
             state = _begun(state, config.start, task)
         journal = Journal(folder, active=first, step=start)
+        if start and output.code_before is not None:
+            journal.write("code", start, {"before": output.code_before, "now": code()})
         ahead = jax.default_backend() != "cpu" if ahead is None else ahead
         with _Pools(task, config, ahead=ahead) as pools:
             run = _Run(config, task, step, pools, checkpoints, journal, report)
@@ -81,6 +97,23 @@ def train_and_evaluate(
     save_model(folder / "model", step.model(state), about=task.about)
     validated = [line for line in read_metrics(folder) if line["kind"] == "validation"]
     return {name: value for name, value in validated[-1].items() if name not in ("kind", "step")}
+
+
+@contextlib.contextmanager
+def _disk_errors(folder: Path) -> Iterator[None]:
+    """What the libraries of checkpoints raise when the disk is full (in words, of many types) as an `InputError`."""
+    try:
+        yield
+    except (InputError, TrainingError):
+        raise
+    except Exception as error:
+        chain: BaseException | None = error
+        while chain is not None:
+            for number in (errno.ENOSPC, errno.EDQUOT):
+                if getattr(chain, "errno", None) == number or os.strerror(number) in str(chain):
+                    raise os_input_error(folder, OSError(number, os.strerror(number)), action="write") from error
+            chain = chain.__cause__ or chain.__context__
+        raise
 
 
 def _begun(state: State, start: str, task: Task) -> State:

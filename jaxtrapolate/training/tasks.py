@@ -28,6 +28,9 @@ class Task(Protocol):
         score: name of the metric of `validate` by which the best checkpoint is told; larger is better.
         about: what the exported weights say about themselves, as in JSON: "method", "config" to build its network with,
             "note".
+
+    A task that learns from frames in files has them in an attribute `sequences`: a run does not go on where they have
+    changed.
     """
 
     score: str

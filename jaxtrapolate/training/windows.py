@@ -236,6 +236,11 @@ class Windows:
         self._render = _mapped(draw, options.together)
         self._prepare = _mapped(lambda w, h, v, key: prepare(flip(w, horizontal=h, vertical=v), key), options.together)
 
+    @property
+    def sequences(self) -> tuple[Sequence, ...]:
+        """The dumps."""
+        return tuple(sequence for sequence, _, _ in self._dumps)
+
     def check_sizes(self) -> None:
         """For a task that keeps whole frames: raise `InputError` where those of a dump are not of `options.size`."""
         expected = self.options.size
