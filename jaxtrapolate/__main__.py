@@ -2,7 +2,7 @@
 
 import sys
 
-from jaxtrapolate.commands.main import script
+from jaxtrapolate.commands.script import script
 
 if __name__ == "__main__":
     sys.exit(script())

@@ -254,7 +254,7 @@ class Scores:
         self._folder, self._metrics = folder, metrics
         compiled, stages = (read_json(folder / f"{name}.json") for name in ("compile", "stages"))
         compiled, stages = (v if isinstance(v, dict) else {} for v in (compiled, stages))
-        self.compile_ms: dict[str, float] = {n: v for n, v in compiled.items() if isinstance(v, int | float)}
+        self.compile_ms: dict[str, float] = {n: float(v) for n, v in compiled.items() if isinstance(v, int | float)}
         self.stages: dict[str, Any] = {n: v for n, v in stages.items() if isinstance(v, dict)}
 
     def frame(self, number: int) -> dict[str, dict[str, Any]]:

@@ -17,8 +17,8 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
-STATUS = 130
-MESSAGE = "jaxtrapolate: interrupted; run again to go on"
+from jaxtrapolate.commands.script import end
+
 _PATIENCE = 5.0  # seconds from Ctrl-C to the end of the process
 _EACH = 0.05  # seconds between looks
 
@@ -30,7 +30,8 @@ def interruptible() -> Iterator[None]:
     Nothing is changed in another than the main thread, or where the process ignores interrupts.
     """
     main = threading.current_thread() is threading.main_thread()
-    if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    previous = signal.getsignal(signal.SIGINT)
+    if not main or previous not in (signal.default_int_handler, end):
         yield
         return
     over, swallowed = threading.Event(), threading.Event()
@@ -67,14 +68,6 @@ def interruptible() -> Iterator[None]:
     finally:
         over.set()
         signal.set_wakeup_fd(previous_descriptor)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, previous)
         sys.unraisablehook = previous_hook
         os.close(writing)  # ends the thread
-
-
-def end() -> None:
-    """Ends the process at once, with the line and the status of an interrupt."""
-    cursor = b"\x1b[?25h\r\x1b[K" if os.isatty(2) else b""  # a progress bar hides it
-    with contextlib.suppress(OSError):
-        os.write(2, cursor + MESSAGE.encode() + b"\n")
-    os._exit(STATUS)

@@ -4,7 +4,6 @@ import argparse
 import contextlib
 import errno
 import os
-import signal
 import sys
 from collections.abc import Sequence
 
@@ -29,22 +28,23 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; 0, or 2 after one line on stderr about input that cannot be used, 130 after Ctrl-C."""
-    try:
-        with interrupt.interruptible():
-            return _run(arguments)
-    except KeyboardInterrupt:
-        print(interrupt.MESSAGE, file=sys.stderr)
-        return interrupt.STATUS
-
-
-def _run(arguments: Sequence[str] | None) -> int:
-    # imported here: an interrupt while JAX is being imported is one like any other
-    from jaxtrapolate.files import InputError
-    from jaxtrapolate.files.atomic import known_os_error, os_input_error
+    options = parser().parse_args(arguments)
     from jaxtrapolate.memory import keep_memory
 
-    options = parser().parse_args(arguments)
     keep_memory()
+    try:
+        # only now: an exception in the middle of importing a C++ extension may crash the process
+        with interrupt.interruptible():
+            return _run(options)
+    except KeyboardInterrupt:
+        print("jaxtrapolate: interrupted; run again to go on", file=sys.stderr)
+        return 130
+
+
+def _run(options: argparse.Namespace) -> int:
+    from jaxtrapolate.files import InputError
+    from jaxtrapolate.files.atomic import known_os_error, os_input_error
+
     try:
         status = options.run(options) or 0
         sys.stdout.flush()
@@ -74,16 +74,3 @@ def _give_up_stdout() -> None:
     """What is still to be written goes nowhere, so that Python does not complain of it at its end."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def script() -> int:
-    """As `main`, for a process of its own: after the command an interrupt just ends it."""
-    status = main()
-    with contextlib.suppress(OSError):
-        sys.stderr.flush()
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    return status
-
-
-if __name__ == "__main__":
-    sys.exit(script())

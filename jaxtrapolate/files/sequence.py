@@ -87,8 +87,12 @@ class Sequence(abc.ABC):
         return {}
 
     def identity(self) -> dict[str, Any]:
-        """What, besides the content of files, decides about what frames hold; what JSON holds, the same in a copy."""
-        return {"size": list(self.size), "hdr": self.hdr, "depth": self.depth, "motion": str(self.convention)}
+        """What, besides the content of `files`, decides about what frames hold: what JSON holds, the same in a copy.
+
+        The name is part of it where there are no files.
+        """
+        read = {} if self.files(self.numbers[0]) else {"input": self.name}
+        return read | {"size": list(self.size), "hdr": self.hdr, "depth": self.depth, "motion": str(self.convention)}
 
     def has_color(self, number: int) -> bool:
         """Whether the frame has colour, without reading it."""

@@ -46,8 +46,8 @@ class SceneSequence(Sequence):
         self.samples = samples
 
     def identity(self) -> dict[str, Any]:
-        """The scene, its seed and the samples a pixel, beside what all sequences have."""
-        return super().identity() | {"scene": self.name, "samples": self.samples}
+        """The samples a pixel, beside what all sequences have; the name holds the seed."""
+        return super().identity() | {"samples": self.samples}
 
     def frame(self, number: int) -> Frame:
         """The frame with every buffer."""

@@ -33,7 +33,7 @@ class Journal:
             with atomic_path(self._path) as temporary:
                 temporary.write_text("".join(_line(entry) for entry in kept))
 
-    def write(self, kind: str, step: int, values: Mapping[str, float]) -> None:
+    def write(self, kind: str, step: int, values: Mapping[str, float | str]) -> None:
         """Adds a line."""
         if self._active:
             with self._path.open("a", encoding="utf-8") as file:
