@@ -6,8 +6,8 @@ from typing import Any
 
 from jaxtrapolate.commands.inputs import add_fresh, check_count, check_seed, parse_size, progress, terminal
 from jaxtrapolate.files import InputError, write_unreal_frame
-from jaxtrapolate.files.reader import BUFFERS, stored_size
-from jaxtrapolate.files.unreal import NAMES
+from jaxtrapolate.files.reader import list_folder, stored_size
+from jaxtrapolate.files.unreal import unreal_files
 from jaxtrapolate.output import open_output
 
 
@@ -42,8 +42,9 @@ def run(options: argparse.Namespace) -> None:
         open_output(options.output, "render", sequence.identity(), fresh=options.fresh) as output,
         progress(console) as bar,
     ):
+        whole = _whole(output.folder, name, size)
         for number in bar.track(sequence.numbers, description="render"):
-            if _whole(output.folder, name, number, size):
+            if number in whole:
                 kept += 1
                 continue
             frame, flows = sequence.frame(number), sequence.keyframe(number)
@@ -52,10 +53,15 @@ def run(options: argparse.Namespace) -> None:
     console.print(text, soft_wrap=True, highlight=False)
 
 
-def _whole(folder: Path, scene: str, number: int, size: tuple[int, int]) -> bool:
-    """Whether all files of a frame are there, in full; the sky is told by the normals and has none."""
-    try:
-        paths = (folder / f"{scene}{NAMES[buffer]}.{number:04d}.exr" for buffer in BUFFERS if buffer != "sky")
-        return all(path.is_file() and stored_size(path) == size for path in paths)
-    except InputError:
-        return False
+def _whole(folder: Path, scene: str, size: tuple[int, int]) -> set[int]:
+    """The frames whose files are all there, in full: those that any frame has, and the one that is written last."""
+    frames = unreal_files(list_folder(folder)).get(scene, {})
+    needed = {"backward_flow"}.union(*frames.values())
+
+    def readable(name: str) -> bool:
+        try:
+            return stored_size(folder / name) == size
+        except InputError:
+            return False
+
+    return {n for n, files in frames.items() if needed <= set(files) and all(map(readable, files.values()))}
