@@ -572,3 +572,30 @@ def test_weight_decay_is_decoupled():
         step = (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-8)
         expected = expected - 0.1 * (step + 0.2 * expected)
         np.testing.assert_allclose(weight, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("when", ["before", "while it is written"])
+def test_a_full_disk_is_one_line(tmp_path, monkeypatch, when):
+    """Told before Orbax begins, or as the one error of all that its threads report."""
+    from types import SimpleNamespace
+
+    from jaxtrapolate.training import checkpoints
+
+    state = {"a": np.zeros((300, 100), np.float32)}
+    with checkpoints.Checkpoints(tmp_path / "c", keep=1, score="x") as kept:
+        kept.save(1, state)
+        if when == "before":
+            usage = SimpleNamespace(free=100_000)
+            monkeypatch.setattr(checkpoints.shutil, "disk_usage", lambda path: usage)
+        else:
+
+            def fail(*_, **__):
+                raise ValueError("RESOURCE_EXHAUSTED: Failed to write: No space left on device [os_error_code='28']")
+
+            monkeypatch.setattr(kept._manager, "save", fail)
+        with pytest.raises(InputError) as error:
+            kept.save(2, state)
+        assert kept.latest() == 1
+    assert "the disk is full" in str(error.value)
+    assert str(tmp_path / "c") in str(error.value)
+    assert "\n" not in str(error.value)

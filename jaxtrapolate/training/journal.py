@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxtrapolate.files import write_png
-from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.files.atomic import atomic_path, os_input_error
 
 METRICS = "metrics.jsonl"
 """Name of the file of metrics: one JSON object a line, with "kind" ("train" or "validation") and "step"."""
@@ -36,8 +36,11 @@ class Journal:
     def write(self, kind: str, step: int, values: Mapping[str, float | str]) -> None:
         """Adds a line."""
         if self._active:
-            with self._path.open("a", encoding="utf-8") as file:
-                file.write(_line({"kind": kind, "step": step, **values}))
+            try:
+                with self._path.open("a", encoding="utf-8") as file:
+                    file.write(_line({"kind": kind, "step": step, **values}))
+            except OSError as error:
+                raise os_input_error(self._path, error, action="write") from error
 
     def images(self, step: int, images: Mapping[str, Any]) -> None:
         """Writes images `[H, W, 3]` in 0..1 as images/<step>-<name>.png."""

@@ -1,13 +1,10 @@
 """The training loop: `train_and_evaluate(config, workdir)`."""
 
 import concurrent.futures
-import contextlib
 import dataclasses
-import errno
 import os
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -72,8 +69,7 @@ def train_and_evaluate(
         task = make_task(config) if task is None else task
         for index, sequence in enumerate(getattr(task, "sequences", ())):
             output.agree_frames(sequence, sequence.numbers, kind=f"frames of dump {index}")
-        with _disk_errors(output.folder):
-            return _train(config, task, output, report, ahead=ahead, first=first)
+        return _train(config, task, output, report, ahead=ahead, first=first)
 
 
 def _train(
@@ -97,23 +93,6 @@ def _train(
     save_model(folder / "model", step.model(state), about=task.about)
     validated = [line for line in read_metrics(folder) if line["kind"] == "validation"]
     return {name: value for name, value in validated[-1].items() if name not in ("kind", "step")}
-
-
-@contextlib.contextmanager
-def _disk_errors(folder: Path) -> Iterator[None]:
-    """What the libraries of checkpoints raise when the disk is full (in words, of many types) as an `InputError`."""
-    try:
-        yield
-    except (InputError, TrainingError):
-        raise
-    except Exception as error:
-        chain: BaseException | None = error
-        while chain is not None:
-            for number in (errno.ENOSPC, errno.EDQUOT):
-                if getattr(chain, "errno", None) == number or os.strerror(number) in str(chain):
-                    raise os_input_error(folder, OSError(number, os.strerror(number)), action="write") from error
-            chain = chain.__cause__ or chain.__context__
-        raise
 
 
 def _begun(state: State, start: str, task: Task) -> State:
