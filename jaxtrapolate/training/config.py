@@ -24,7 +24,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from jaxtrapolate.files import InputError
-from jaxtrapolate.files.atomic import atomic_path, os_input_error
+from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.files.text import read_json, read_toml
 from jaxtrapolate.training.tasks import Task, find_task
 
 T = TypeVar("T")
@@ -230,18 +231,19 @@ def load_config(name: str | os.PathLike[str], changes: Mapping[str, Any] | None 
     text = os.fspath(name)
     shipped = _shipped()
     try:
-        content = shipped[text].read_text() if text in shipped else Path(text).read_text(encoding="utf-8")
-        table = tomllib.loads(content)
+        table = tomllib.loads(shipped[text].read_text()) if text in shipped else _read_toml(text, shipped)
         for key, value in (changes or {}).items():
             _put(table, key, value)
         return parse_config(table)
-    except OSError as error:
-        if not text.endswith(".toml") and not Path(text).exists():
-            there = f"the shipped ones are {', '.join(shipped)}" if shipped else "none are shipped"
-            raise InputError(f"{text}: no such configuration or TOML file; {there}") from error
-        raise os_input_error(text, error) from error
-    except (ValueError, UnicodeDecodeError) as error:  # also what is no TOML
+    except (ValueError, OverflowError) as error:
         raise InputError(f"{text}: {error}") from error
+
+
+def _read_toml(text: str, shipped: Mapping[str, Any]) -> dict[str, Any]:
+    if not text.endswith(".toml") and not os.path.lexists(text):
+        there = f"the shipped ones are {', '.join(shipped)}" if shipped else "none are shipped"
+        raise InputError(f"{text}: no such configuration or TOML file; {there}")
+    return read_toml(text)
 
 
 def _put(table: dict[str, Any], key: str, value: Any) -> None:
@@ -281,12 +283,7 @@ def keep_config(config: Config, path: Path, *, write: bool = True) -> None:
         InputError: the file's differs; the fields are named.
     """
     new = dataclasses.asdict(config)
-    try:
-        old = json.loads(path.read_text()) if path.exists() else None
-    except OSError as error:
-        raise os_input_error(path, error) from error
-    except ValueError as error:
-        raise InputError(f"{path}: no JSON ({error}); choose another workdir") from error
+    old = read_json(path) if os.path.lexists(path) else None
     if old is not None:
         if changes := differences(old, new):
             raise InputError(f"{path.parent}: holds a run of another configuration: {changes}; choose another workdir")
