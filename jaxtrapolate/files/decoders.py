@@ -145,6 +145,7 @@ def _pillow(kind: str) -> Reader:
 def _open(kind: str, stream: BinaryIO) -> Any:
     """A Pillow image of this one kind: no other plugin looks at the file."""
     name = _PLUGINS[kind]
+    stream.seek(0)
     return getattr(importlib.import_module(f"PIL.{name}ImagePlugin"), f"{name}ImageFile")(stream)
 
 
@@ -156,7 +157,6 @@ def _wide(image: Any, raw: str, stream: BinaryIO) -> np.ndarray:
     """
 
     def bytes_by(layout: str) -> np.ndarray:
-        stream.seek(0)
         again = _open("PNG", stream)
         again.tile = [t._replace(args=layout) if hasattr(t, "_replace") else (*t[:3], layout) for t in again.tile]
         return np.array(again).astype(np.uint16)
@@ -311,12 +311,10 @@ def _rgbe(path: str | os.PathLike[str], data: bytes, height: int, width: int) ->
     """The four bytes of every pixel, `[H, W, 4]`."""
     lead = bytes((2, 2, width >> 8, width & 255)) if 8 <= width < 32768 else b""
     if not (lead and data.startswith(lead)):
-        if len(data) < 4 * height * width:
-            raise EOFError("fewer bytes than the header states")
-        plain = np.frombuffer(data, np.uint8, 4 * height * width).reshape(height, width, 4)
-        if (plain[..., :3] == 1).all(axis=-1).any():
+        plain = np.frombuffer(data, np.uint8, len(data) // 4 * 4).reshape(-1, 4)[: height * width]
+        if (plain[:, :3] == 1).all(axis=-1).any():
             raise InputError(f"{path}: Radiance HDR in runs of the layout before 1991, which is not read; {_STORE}")
-        return plain
+        return plain.reshape(height, width, 4)
     if len(data) < height * (4 + 4 * 2 * -(-width // 127)):
         raise EOFError("fewer bytes than the header states")
     rows = []

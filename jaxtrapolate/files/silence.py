@@ -17,21 +17,27 @@ from typing import Any
 
 _lock = threading.Lock()
 _inside = 0
-_saved: tuple[Any, Any] | None = None
+_pointer: int | None = None
 _muted = threading.local()
 
 
 class _Output:
-    """`sys.stdout` for all threads but those that are muted."""
+    """`sys.stdout` for all threads but those that are muted.
 
-    def __init__(self, stream: Any):
-        self.stream = stream
+    There is one for ever: CPython's `print` holds no reference to the stream that it has looked up, so that one that
+    goes away while another thread prints to it ends the process.
+    """
+
+    stream: Any = None
 
     def write(self, text: str) -> int:
         return len(text) if getattr(_muted, "depth", 0) else self.stream.write(text)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.stream, name)
+
+
+_output = _Output()
 
 
 @functools.cache
@@ -64,26 +70,22 @@ def silence() -> Iterator[None]:
 
 
 def _enter() -> None:
-    global _inside, _saved
+    global _inside, _pointer
     with _lock:
         _inside += 1
         if _inside == 1:
-            output = _Output(sys.stdout)
-            streams = _streams()
-            _saved = (output, None if streams is None else streams[0].value)
-            sys.stdout = output
-            if streams is not None:
-                streams[0].value = streams[1]
+            _output.stream, sys.stdout = sys.stdout, _output
+            if (streams := _streams()) is not None:
+                variable, null = streams
+                _pointer, variable.value = variable.value, null
 
 
 def _leave() -> None:
-    global _inside, _saved
+    global _inside
     with _lock:
         _inside -= 1
-        if _inside == 0 and _saved is not None:
-            output, pointer = _saved
-            if sys.stdout is output:  # else somebody has set another one meanwhile
-                sys.stdout = output.stream
-            if pointer is not None and (streams := _streams()) is not None:
-                streams[0].value = pointer
-            _saved = None
+        if _inside == 0:
+            if sys.stdout is _output:  # else somebody has set another one meanwhile
+                sys.stdout = _output.stream
+            if (streams := _streams()) is not None:
+                streams[0].value = _pointer
