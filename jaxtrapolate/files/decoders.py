@@ -16,18 +16,20 @@ nothing that Pillow would start a program for, and nothing whose colours are not
 
 import dataclasses
 import importlib
-import logging
 import os
 import re
+import threading
+import warnings
 from collections.abc import Callable
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from jaxtrapolate.files.atomic import os_input_error
-from jaxtrapolate.files.limits import check_pixels
+from jaxtrapolate.files.limits import check_claim, check_pixels
 from jaxtrapolate.files.regular import open_regular
 from jaxtrapolate.files.sequence import InputError
+from jaxtrapolate.files.silence import silence
 
 KINDS = "PNG, JPEG, BMP, TGA, TIFF, Radiance HDR, .flo or .npy"
 _STORE = "store it as EXR or PNG"
@@ -64,7 +66,7 @@ def decode(path: str | os.PathLike[str], *, pixels: bool = True) -> Decoded:
             large (`jaxtrapolate.files.limits`), of several pictures, or in other colours than grey and RGB.
     """
     try:
-        with open_regular(path) as stream:
+        with open_regular(path) as stream, silence():
             head = stream.read(16)
             stream.seek(0)
             header, array = _reader(path, head)(path, stream, pixels)
@@ -109,10 +111,10 @@ def _reader(path: str | os.PathLike[str], head: bytes) -> Reader:
 
 def _pillow(kind: str) -> Reader:
     def read(path: str | os.PathLike[str], stream: BinaryIO, pixels: bool) -> Decoded:
+        if kind == "PNG" and _animated(stream):
+            raise InputError(f"{path}: holds several pictures (an animated PNG); store one in each file")
         image = _open(kind, stream)
         check_pixels(path, image.height, image.width)
-        if getattr(image, "is_animated", False):
-            raise InputError(f"{path}: holds several pictures; store one in each file")
         raw = str(image.tile[0][3]) if image.tile else ""
         wide = ";16" in raw and kind == "PNG"
         if image.mode in ("P", "PA"):
@@ -149,6 +151,16 @@ def _open(kind: str, stream: BinaryIO) -> Any:
     return getattr(importlib.import_module(f"PIL.{name}ImagePlugin"), f"{name}ImageFile")(stream)
 
 
+def _animated(stream: BinaryIO) -> bool:
+    """Whether a PNG has the chunk of animations before its pixels."""
+    stream.seek(8)
+    while len(start := stream.read(8)) == 8:
+        if start[4:] in (b"IDAT", b"acTL"):
+            return start[4:] == b"acTL"
+        stream.seek(int.from_bytes(start[:4], "big") + 4, os.SEEK_CUR)
+    return False
+
+
 def _wide(image: Any, raw: str, stream: BinaryIO) -> np.ndarray:
     """The 16-bit codes of a PNG with several channels, of which Pillow keeps the upper bytes alone.
 
@@ -177,7 +189,6 @@ def _with_key(codes: np.ndarray, key: Any, raw: str) -> np.ndarray:
 def _tiff(path: str | os.PathLike[str], stream: BinaryIO, pixels: bool) -> Decoded:
     import tifffile
 
-    _quiet_tifffile()
     with tifffile.TiffFile(stream, name="image.tif") as file:
         page: Any = file.pages.first
         height, width, samples = int(page.imagelength), int(page.imagewidth), int(page.samplesperpixel)
@@ -196,17 +207,18 @@ def _tiff(path: str | os.PathLike[str], stream: BinaryIO, pixels: bool) -> Decod
         if not plain:
             if dtype.kind != "b" and dtype != np.uint8:
                 raise InputError(f"{path}: {page.photometric.name.lower()} of {dtype} cannot be read; {_STORE}")
-            return _pillow("TIFF")(path, stream, pixels)
+            return _pillow_tiff(path, stream, pixels)
         header = ImageHeader((height, width), samples, dtype, samples in (2, 4) and bool(extra) and extra[-1] in (1, 2))
         if not pixels:
             return header, None
+        check_claim(path, height * width * samples * dtype.itemsize, os.fstat(stream.fileno()).st_size)
         try:
             array = np.asarray(page.asarray(maxworkers=1))
         except ValueError as error:
             if "imagecodecs" not in str(error):
                 raise
             if dtype == np.uint8:
-                return _pillow("TIFF")(path, stream, pixels)
+                return _pillow_tiff(path, stream, pixels)
             name = getattr(page.compression, "name", page.compression)
             text = f"compressed by {name}, for which the package imagecodecs is needed"
             raise InputError(f"{path}: {text}; run: pip install imagecodecs, or {_STORE}") from error
@@ -216,19 +228,22 @@ def _tiff(path: str | os.PathLike[str], stream: BinaryIO, pixels: bool) -> Decod
         return header, array if array.ndim == 3 else array[..., None]
 
 
+_warnings = threading.Lock()
+
+
+def _pillow_tiff(path: str | os.PathLike[str], stream: BinaryIO, pixels: bool) -> Decoded:
+    """What tifffile cannot decode; Pillow warns of odd tags, and the filters of warnings are one for all threads."""
+    with _warnings, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return _pillow("TIFF")(path, stream, pixels)
+
+
 def _several(file: Any) -> bool:
     """Whether there is a second picture that is no smaller copy or mask of the first."""
     try:
         return not int(file.pages[1].subfiletype) & 5
     except IndexError:
         return False
-
-
-def _quiet_tifffile() -> None:
-    """Its warnings about odd files are for nobody: what matters becomes an error."""
-    logger = logging.getLogger("tifffile")
-    if not logger.handlers:
-        logger.addHandler(logging.NullHandler())
 
 
 def _claimed(stream: BinaryIO, count: int) -> bytes:
@@ -254,7 +269,7 @@ def _npy(path: str | os.PathLike[str], stream: BinaryIO, pixels: bool) -> Decode
         return header, None
     data = np.frombuffer(_claimed(stream, height * width * channels * dtype.itemsize), dtype)
     array = data.reshape(shape, order="F" if fortran else "C").reshape(height, width, channels)
-    return header, array.astype(plain) * (255 if dtype.kind == "b" else 1)
+    return header, array.astype(plain) * np.uint8(255) if dtype.kind == "b" else array.astype(plain)
 
 
 def _flo(path: str | os.PathLike[str], stream: BinaryIO, pixels: bool) -> Decoded:

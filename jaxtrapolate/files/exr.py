@@ -169,7 +169,13 @@ def pick(
     if len(names) < count:
         have = ", ".join(stored)
         raise InputError(f"{path}: needs {wanted}, has {have}; name the layer and channels in a jaxtrapolate.toml")
-    return np.stack([stored[name].astype(np.float32) for name in names[:count]], axis=-1)
+    return quiet(np.stack([stored[name].astype(np.float32) for name in names[:count]], axis=-1))
+
+
+def quiet(image: np.ndarray) -> np.ndarray:
+    """A float image with quiet NaNs, in place: those that signal warn in the arithmetic of every later step."""
+    with np.errstate(invalid="ignore"):
+        return np.multiply(image, image.dtype.type(1), out=image)
 
 
 def write_exr(

@@ -14,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 
 from jaxtrapolate.files.atomic import os_input_error
-from jaxtrapolate.files.limits import check_pixels
+from jaxtrapolate.files.limits import check_claim, check_pixels
 from jaxtrapolate.files.regular import open_regular
 from jaxtrapolate.files.sequence import InputError
 
@@ -75,13 +75,16 @@ def check_limits(path: str | os.PathLike[str], parts: tuple[ExrPart, ...]) -> No
     The display window is what is asked for when channels are put into it, the data window what the library asks for.
     """
     channels = sum(len(part.channels) for part in parts)
+    claimed = 0
     for part in parts:
         check_pixels(path, *part.size, channels)
         x0, y0, x1, y1 = part.data
         check_pixels(path, y1 - y0 + 1, x1 - x0 + 1, channels)
+        claimed += (y1 - y0 + 1) * (x1 - x0 + 1) * len(part.channels) * 2
         if max(map(abs, part.data + part.display)) > _FARTHEST:
             text = f"its windows {part.display} and {part.data} lie more than {_FARTHEST} pixels away"
             raise InputError(f"{path}: {text}; render or copy it again")
+    check_claim(path, claimed, os.stat(path).st_size)
 
 
 def _parse(data: bytes) -> tuple[tuple[ExrPart, ...], int]:

@@ -18,6 +18,7 @@ MAX_PIXELS = 40_000_000
 """The limit where the environment does not state one."""
 MAX_CHANNELS = 1024
 _SAMPLES = 32
+_SMALL, _STRONGEST = 1 << 26, 1 << 18
 
 
 def max_pixels() -> int:
@@ -49,3 +50,14 @@ def check_pixels(path: str | os.PathLike[str], height: int, width: int, channels
     if height * width * channels > _SAMPLES * limit:
         what = f"{channels} channels of {width}x{height} are more than {_SAMPLES} times {limit} samples"
         raise InputError(f"{path}: {what}, the most that is read; store fewer in one file, or {remedy}")
+
+
+def check_claim(path: str | os.PathLike[str], claimed: int, length: int) -> None:
+    """Raise `InputError` where a compressed file of `length` bytes claims far more bytes of pixels than it can hold.
+
+    The strongest compression that is known, of frames of one colour, is 1 : 35000; refused are 1 : 262144 and beyond,
+    from 64 MiB on.
+    """
+    if claimed > max(_SMALL, length * _STRONGEST):
+        text = f"claims {claimed} bytes of pixels, which its {length} bytes cannot hold"
+        raise InputError(f"{path}: {text}; render or copy it again")

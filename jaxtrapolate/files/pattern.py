@@ -62,7 +62,7 @@ import numpy as np
 
 from jaxtrapolate.files.alpha import without_empty
 from jaxtrapolate.files.decoders import ImageHeader
-from jaxtrapolate.files.exr import pick, read_exr
+from jaxtrapolate.files.exr import pick, quiet, read_exr
 from jaxtrapolate.files.image import decode_srgb, image_header, read_image
 from jaxtrapolate.files.reader import BUFFERS, FileSequence, Opened, frame_number, list_folder
 from jaxtrapolate.files.sequence import InputError, MotionConvention
@@ -297,8 +297,8 @@ def _values(path: Path, header: ImageHeader, pixels: np.ndarray, buffer: str, sp
         raise InputError(f"{path}: {buffer} needs {count} channels ({', '.join(wanted)}), has {have}; correct the TOML")
     stored = pixels[..., places[: len(wanted)]]
     if buffer == "stencil" or spec.codes or not header.codes:
-        with np.errstate(over="ignore"):
-            image = stored.astype(np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):
+            image = quiet(stored.astype(np.float32))
     elif spec.srgb:
         image = decode_srgb(stored)
     else:

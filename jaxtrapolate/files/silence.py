@@ -1,14 +1,16 @@
-"""The terminal while OpenEXR decodes: what the library prints about a bad file stays away from it.
+"""The terminal while a library decodes: what it prints about a bad file stays away from it.
 
 OpenEXR says what is wrong with a file in two ways besides its exception: in C, to the stream `stderr`, and in Python,
-to `sys.stdout`. Other threads draw a progress bar meanwhile, since decoding releases the interpreter. So no file
-descriptor is redirected. The C stream is exchanged for one to the null device, which nothing written in Python
-goes through; and of `sys.stdout` only what the decoding thread itself writes is left out.
+to `sys.stdout`; libtiff does so in C, tifffile and Pillow to loggers. Other threads draw a progress bar meanwhile,
+since decoding releases the interpreter. So no file descriptor is redirected. The C stream is exchanged for one to the
+null device, which nothing written in Python goes through; and of `sys.stdout` and of the loggers only what the
+decoding thread itself writes is left out.
 """
 
 import contextlib
 import ctypes
 import functools
+import logging
 import os
 import sys
 import threading
@@ -38,6 +40,20 @@ class _Output:
 
 
 _output = _Output()
+_LOGGERS = ("tifffile", "PIL.TiffImagePlugin", "PIL.PngImagePlugin")
+
+
+class _Filter(logging.Filter):
+    """Lets pass what other threads log."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        return not getattr(_muted, "depth", 0)
+
+
+@functools.cache
+def _filter_loggers() -> None:
+    for name in _LOGGERS:
+        logging.getLogger(name).addFilter(_Filter())
 
 
 @functools.cache
@@ -59,7 +75,8 @@ def _streams() -> tuple[Any, int] | None:
 
 @contextlib.contextmanager
 def silence() -> Iterator[None]:
-    """Within the block, C code prints nothing to its `stderr`, and this thread nothing to `sys.stdout`."""
+    """Within the block C code prints nothing to its `stderr`, this thread nothing to `sys.stdout` and the loggers."""
+    _filter_loggers()
     _enter()
     _muted.depth = getattr(_muted, "depth", 0) + 1
     try:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import tomllib
 from collections.abc import Callable
 from typing import Any
@@ -10,19 +11,27 @@ from jaxtrapolate.files.atomic import os_input_error
 from jaxtrapolate.files.regular import open_regular
 from jaxtrapolate.files.sequence import InputError
 
-LARGEST = 1 << 24
+LARGEST = 1 << 20
 """Bytes: no file of settings is larger."""
 _DEEPEST = 64
+_LONG_KEY = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){65}""")
+"""A key of more than 64 parts, which takes tomllib a time that grows with the square of them."""
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The table in a TOML file.
 
     Raises:
-        InputError: missing, no regular file, more than 16 MiB, not UTF-8, not TOML, nested deeper than 64 tables or
+        InputError: missing, no regular file, more than 1 MiB, not UTF-8, not TOML, nested deeper than 64 tables or
             arrays, or an integer that 64 bits do not hold.
     """
-    return _read(path, "TOML", tomllib.loads)
+
+    def parse(text: str) -> dict[str, Any]:
+        if _LONG_KEY.search(text):
+            raise RecursionError
+        return tomllib.loads(text)
+
+    return _read(path, "TOML", parse)
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
