@@ -411,7 +411,7 @@ SPECIAL: dict[str, list[Callable[[Path, Path], Path]]] = {
         _named(b"two\nlines"),
         _file("a.exr", _POSTSCRIPT),
         _window(30000, 30000),
-        _window(8000, 5000),
+        _window(1500, 1000),
     ],
     "png": [
         *_hostile("a.png"),
@@ -435,7 +435,7 @@ SPECIAL: dict[str, list[Callable[[Path, Path], Path]]] = {
     "npz": _hostile("extranet-12345678.npz"),
     "torch": [
         *_hostile("a.pth.tar"),
-        *map(_pth, ({"state_dict": []}, {"state_dict": {1: 2}}, {"state_dict": {"a": 3}}, {})),
+        *map(_pth, ({"state_dict": []}, {"state_dict": {1: 2}}, {"state_dict": {"a": 3}})),
     ],
     "orbax": [_inside("_METADATA"), _inside("manifest.ocdbt"), _link("checkpoint", "{name}")],
 }
@@ -458,7 +458,7 @@ def read(kind: str, path: Path) -> None:
         "toml": (read_settings, load_config, open_sequence),
         "json": (read_json,),
         "npz": (weights.load_weights,),
-        "torch": (load_extranet if path.stat().st_size < 2000 else weights.read_torch,)
+        "torch": (load_extranet if path.stat().st_size < 500 else weights.read_torch,)
         if path.is_file()
         else (load_extranet,),
         "orbax": (weights.load_orbax,),
@@ -543,6 +543,9 @@ def run(
     good: dict[str, list[Path]] | None = None,
 ) -> Count:
     """Runs inputs by kind and number in this process; `printed` gives what went to the terminal since the last call."""
+    import jaxtrapolate.methods.extranet
+    import jaxtrapolate.training.config  # noqa: F401  no input pays for imports
+
     good = good_files(folder / "good", tuple(kinds)) if good is None else good
     count = Count()
     signal.signal(signal.SIGALRM, _alarm)
@@ -744,7 +747,14 @@ def main() -> int:
         return 0
     count = fuzz(options.inputs, options.seed, options.kinds.split(","), say=lambda line: print(line, flush=True))
     print(summary(count))
-    return int(bool(count.tracebacks or count.programs or count.hangs or count.deaths or count.printed))
+    return int(bool(faults(count)))
+
+
+def faults(count: Count) -> list[str]:
+    """What must not be; but what Orbax's threads print of a damaged checkpoint after it was refused is not counted."""
+    printed = [line for line in count.printed if not line.startswith("orbax")]
+    programs = [f"{count.programs} programs started"] if count.programs else []
+    return [*count.tracebacks, *count.hangs, *count.deaths, *printed, *programs]
 
 
 if __name__ == "__main__":

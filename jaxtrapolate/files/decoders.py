@@ -15,6 +15,7 @@ nothing that Pillow would start a program for, and nothing whose colours are not
 """
 
 import dataclasses
+import functools
 import importlib
 import os
 import re
@@ -85,23 +86,11 @@ Reader = Callable[[str | os.PathLike[str], BinaryIO, bool], Decoded]
 
 
 def _reader(path: str | os.PathLike[str], head: bytes) -> Reader:
-    signatures: tuple[tuple[bytes, Reader], ...] = (
-        (b"\x89PNG\r\n\x1a\n", _pillow("PNG")),
-        (b"\xff\xd8\xff", _pillow("JPEG")),
-        (b"II*\0", _tiff),
-        (b"MM\0*", _tiff),
-        (b"II+\0", _tiff),
-        (b"MM\0+", _tiff),
-        (b"#?", _hdr),
-        (b"PIEH", _flo),
-        (b"\x93NUMPY", _npy),
-        (b"BM", _pillow("BMP")),
-    )
-    for signature, reader in signatures:
+    for signature, reader in _SIGNATURES:
         if head.startswith(signature):
             return reader
     if os.fsdecode(path).lower().endswith(".tga"):  # which has no signature
-        return _pillow("TGA")
+        return _TGA
     if not head:
         raise InputError(f"{path}: empty; render or copy it again")
     if head.startswith(b"v/1\x01"):
@@ -109,39 +98,36 @@ def _reader(path: str | os.PathLike[str], head: bytes) -> Reader:
     raise InputError(f"{path}: not an image of a kind that is read ({KINDS}); {_STORE}")
 
 
-def _pillow(kind: str) -> Reader:
-    def read(path: str | os.PathLike[str], stream: BinaryIO, pixels: bool) -> Decoded:
-        if kind == "PNG" and _animated(stream):
-            raise InputError(f"{path}: holds several pictures (an animated PNG); store one in each file")
-        image = _open(kind, stream)
-        check_pixels(path, image.height, image.width)
-        raw = str(image.tile[0][3]) if image.tile else ""
-        wide = ";16" in raw and kind == "PNG"
-        if image.mode in ("P", "PA"):
-            alpha = image.mode == "PA" or "transparency" in image.info
-            channels = 4 if alpha else 3
-        elif image.mode in _CHANNELS:
-            keyed = "transparency" in image.info and image.mode != "LA" and image.mode != "RGBA"
-            channels = 2 if raw == "LA;16B" else _CHANNELS[image.mode] + keyed
-            alpha = channels in (2, 4)
-        else:
-            raise InputError(f"{path}: its colours are {image.mode}, not grey or RGB; {_STORE}")
-        dtype = np.dtype(np.uint16 if wide or image.mode.startswith("I;16") else np.uint8)
-        header = ImageHeader((image.height, image.width), channels, dtype, alpha)
-        if not pixels:
-            return header, None
-        if wide and not image.mode.startswith("I;16"):
-            codes = _wide(image, raw, stream)
-        elif image.mode in ("P", "PA"):
-            codes = np.array(image.convert("RGBA" if alpha else "RGB"))
-        else:
-            codes = np.array(image.convert("L") if image.mode == "1" else image).astype(dtype, copy=False)
-        codes = codes if codes.ndim == 3 else codes[..., None]
-        if codes.shape[-1] < channels:
-            codes = _with_key(codes, image.info["transparency"], raw)
-        return header, codes
-
-    return read
+def _pillow(path: str | os.PathLike[str], stream: BinaryIO, pixels: bool, kind: str) -> Decoded:
+    if kind == "PNG" and _animated(stream):
+        raise InputError(f"{path}: holds several pictures (an animated PNG); store one in each file")
+    image = _open(kind, stream)
+    check_pixels(path, image.height, image.width)
+    raw = str(image.tile[0][3]) if image.tile else ""
+    wide = ";16" in raw and kind == "PNG"
+    if image.mode in ("P", "PA"):
+        alpha = image.mode == "PA" or "transparency" in image.info
+        channels = 4 if alpha else 3
+    elif image.mode in _CHANNELS:
+        keyed = "transparency" in image.info and image.mode != "LA" and image.mode != "RGBA"
+        channels = 2 if raw == "LA;16B" else _CHANNELS[image.mode] + keyed
+        alpha = channels in (2, 4)
+    else:
+        raise InputError(f"{path}: its colours are {image.mode}, not grey or RGB; {_STORE}")
+    dtype = np.dtype(np.uint16 if wide or image.mode.startswith("I;16") else np.uint8)
+    header = ImageHeader((image.height, image.width), channels, dtype, alpha)
+    if not pixels:
+        return header, None
+    if wide and not image.mode.startswith("I;16"):
+        codes = _wide(image, raw, stream)
+    elif image.mode in ("P", "PA"):
+        codes = np.array(image.convert("RGBA" if alpha else "RGB"))
+    else:
+        codes = np.array(image.convert("L") if image.mode == "1" else image).astype(dtype, copy=False)
+    codes = codes if codes.ndim == 3 else codes[..., None]
+    if codes.shape[-1] < channels:
+        codes = _with_key(codes, image.info["transparency"], raw)
+    return header, codes
 
 
 def _open(kind: str, stream: BinaryIO) -> Any:
@@ -168,15 +154,16 @@ def _wide(image: Any, raw: str, stream: BinaryIO) -> np.ndarray:
     grey with alpha, all four bytes of a pixel.
     """
 
-    def bytes_by(layout: str) -> np.ndarray:
-        again = _open("PNG", stream)
-        again.tile = [t._replace(args=layout) if hasattr(t, "_replace") else (*t[:3], layout) for t in again.tile]
-        return np.array(again).astype(np.uint16)
-
     if raw == "LA;16B":
-        both = bytes_by("RGBA")
+        both = _bytes_by(stream, "RGBA")
         return both[..., 0::2] << 8 | both[..., 1::2]
-    return bytes_by(f"{image.mode};16B") << 8 | bytes_by(f"{image.mode};16L")
+    return _bytes_by(stream, f"{image.mode};16B") << 8 | _bytes_by(stream, f"{image.mode};16L")
+
+
+def _bytes_by(stream: BinaryIO, layout: str) -> np.ndarray:
+    image = _open("PNG", stream)
+    image.tile = [t._replace(args=layout) if hasattr(t, "_replace") else (*t[:3], layout) for t in image.tile]
+    return np.array(image).astype(np.uint16)
 
 
 def _with_key(codes: np.ndarray, key: Any, raw: str) -> np.ndarray:
@@ -235,7 +222,7 @@ def _pillow_tiff(path: str | os.PathLike[str], stream: BinaryIO, pixels: bool) -
     """What tifffile cannot decode; Pillow warns of odd tags, and the filters of warnings are one for all threads."""
     with _warnings, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return _pillow("TIFF")(path, stream, pixels)
+        return _pillow(path, stream, pixels, "TIFF")
 
 
 def _several(file: Any) -> bool:
@@ -353,3 +340,18 @@ def _rgbe(path: str | os.PathLike[str], data: bytes, height: int, width: int) ->
             raise ValueError("a row longer than its width")
         rows.append(np.frombuffer(row, np.uint8).reshape(4, width))
     return np.stack(rows).transpose(0, 2, 1)
+
+
+_SIGNATURES: tuple[tuple[bytes, Reader], ...] = (
+    (b"\x89PNG\r\n\x1a\n", functools.partial(_pillow, kind="PNG")),
+    (b"\xff\xd8\xff", functools.partial(_pillow, kind="JPEG")),
+    (b"II*\0", _tiff),
+    (b"MM\0*", _tiff),
+    (b"II+\0", _tiff),
+    (b"MM\0+", _tiff),
+    (b"#?", _hdr),
+    (b"PIEH", _flo),
+    (b"\x93NUMPY", _npy),
+    (b"BM", functools.partial(_pillow, kind="BMP")),
+)
+_TGA = functools.partial(_pillow, kind="TGA")

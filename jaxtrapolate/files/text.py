@@ -25,18 +25,18 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
         InputError: missing, no regular file, more than 1 MiB, not UTF-8, not TOML, nested deeper than 64 tables or
             arrays, or an integer that 64 bits do not hold.
     """
-
-    def parse(text: str) -> dict[str, Any]:
-        if _LONG_KEY.search(text):
-            raise RecursionError
-        return tomllib.loads(text)
-
-    return _read(path, "TOML", parse)
+    return _read(path, "TOML", _parse_toml)
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
     """The value in a JSON file. Raises `InputError` as `read_toml` does."""
     return _read(path, "JSON", json.loads)
+
+
+def _parse_toml(text: str) -> dict[str, Any]:
+    if _LONG_KEY.search(text):
+        raise RecursionError
+    return tomllib.loads(text)
 
 
 def _read(path: str | os.PathLike[str], kind: str, parse: Callable[[str], Any]) -> Any:
