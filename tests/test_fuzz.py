@@ -3,7 +3,7 @@
 import fuzz_readers
 import pytest
 
-SHORT = {"exr": 60, "png": 40, "tiff": 40, "image": 40, "toml": 50, "json": 20, "npz": 30, "torch": 40}
+SHORT = {"exr": 30, "png": 20, "tiff": 20, "image": 20, "toml": 30, "json": 12, "npz": 15, "torch": 20}
 
 
 def test_a_few_inputs_of_every_kind(tmp_path, monkeypatch, capfd):
@@ -16,7 +16,7 @@ def test_a_few_inputs_of_every_kind(tmp_path, monkeypatch, capfd):
     assert fuzz_readers.faults(count) == []
     assert count.inputs == count.accepted + count.refused == sum(SHORT.values())
     assert count.accepted >= 10
-    assert count.refused >= 100
+    assert count.refused >= 80
 
 
 def test_what_must_not_be_is_noticed(tmp_path, monkeypatch, capfd):

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import pickle
+import shutil
 import sys
 import zipfile
 
@@ -19,6 +20,7 @@ from torch_files import Named, Writer, pickled, tensor, write
 
 from jaxtrapolate import weights
 from jaxtrapolate.files import InputError
+from jaxtrapolate.methods.extranet import load_extranet
 from jaxtrapolate.weights.pickled import read_pickle
 from jaxtrapolate.weights.tree import nested
 
@@ -515,6 +517,82 @@ def test_default_weights(tmp_path, monkeypatch):
         weights.default_weights("extranet")
 
 
+def _npz(folder, members):
+    """A file of weights with the right hash, whose members are these bytes."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    path = folder / f"a-{hashlib.sha256(buffer.getvalue()).hexdigest()[:8]}.npz"
+    path.write_bytes(buffer.getvalue())
+    return path
+
+
+def _array(header):
+    return b"\x93NUMPY\x01\0" + len(header).to_bytes(2, "little") + header
+
+
+HEADERS = {
+    "brackets": b"{'descr': " + b"(" * 300 + b")" * 300 + b"}\n",
+    "no end": b"{'descr': \"\"\"<f4, 'shape': (3,\n",
+    "zeros": bytes(100),
+    "number": b"{'descr': '<f4', 'fortran_order': False, 'shape': (" + b"9" * 5000 + b",)}\n",
+    "large": b"{'descr': '<f4', 'fortran_order': False, 'shape': (4000000000000,)}\n",
+}
+
+
+@pytest.mark.parametrize("case", sorted(HEADERS))
+def test_damaged_headers_of_arrays(tmp_path, case):
+    path = _npz(tmp_path, {"a.npy": _array(HEADERS[case])})
+    with pytest.raises(ValueError, match="no weights of this library") as error:
+        weights.load_weights(path)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+def test_nested_metadata(tmp_path):
+    text = b'{"method": "a", "note": "", "config": ' + b'{"a":' * 100_000 + b"1" + b"}" * 100_000 + b"}"
+    header = f"{{'descr': '|S{len(text)}', 'fortran_order': False, 'shape': ()}}\n".encode()
+    path = _npz(tmp_path, {"__metadata__.npy": _array(header) + text})
+    with pytest.raises(ValueError, match="no weights of this library"):
+        weights.load_weights(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+@pytest.mark.parametrize("name", ["a-12345678.npz", "a.pth.tar"])
+def test_only_regular_files_are_weights(tmp_path, name):
+    read = weights.load_weights if name.endswith("npz") else weights.read_torch
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(OSError, match="is a named pipe, not a regular file"):
+        read(tmp_path / name)
+    (tmp_path / name).unlink()
+    (tmp_path / name).symlink_to("/dev/zero")
+    with pytest.raises(OSError, match="is a device, not a regular file"):
+        read(tmp_path / name)
+    (tmp_path / name).unlink()
+    (tmp_path / name).symlink_to(name)
+    with pytest.raises(OSError, match="symbolic links"):
+        read(tmp_path / name)
+
+
+def test_lines_about_names_that_are_no_utf8(tmp_path):
+    path = os.path.join(tmp_path, os.fsdecode(b"caf\xe9\n-12345678.npz"))
+    with open(path, "wb") as file:
+        file.write(b"nothing")
+    for read in (weights.load_weights, weights.read_torch):
+        with pytest.raises(ValueError, match=r"caf\\udce9\\n-12345678\.npz: ") as error:
+            read(path)
+        str(error.value).encode("utf-8")
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("state", [[], {1: 2}, {"a": 3}, None, {"a": [1]}])
+def test_a_state_dict_that_is_none(tmp_path, state):
+    path = write(tmp_path / "a.pth.tar", {"state_dict": state})
+    with pytest.raises(ValueError, match=r"a\.pth\.tar: no weights of ExtraNet: .*(no table of arrays|is no array)"):
+        load_extranet(path)
+
+
 # Orbax
 
 
@@ -559,3 +637,18 @@ def test_other_folders_are_no_checkpoints(orbax, tmp_path):
     (tmp_path / "_METADATA").write_text("{}")
     with pytest.raises(ValueError, match="damaged Orbax checkpoint"):
         weights.load_orbax(tmp_path)
+
+
+def test_pipes_devices_and_circles_in_a_checkpoint(orbax, tmp_path):
+    shutil.copytree(orbax / "plain", tmp_path / "pipe")
+    os.mkfifo(tmp_path / "pipe" / "more")
+    with pytest.raises(ValueError, match=r"damaged Orbax checkpoint \(more is no regular file\)"):
+        weights.load_orbax(tmp_path / "pipe")
+    shutil.copytree(orbax / "plain", tmp_path / "device")
+    (tmp_path / "device" / "_METADATA").unlink()
+    (tmp_path / "device" / "_METADATA").symlink_to("/dev/zero")
+    with pytest.raises(ValueError, match="no Orbax checkpoint"):
+        weights.load_orbax(tmp_path / "device")
+    (tmp_path / "circle").symlink_to("circle")
+    with pytest.raises(ValueError, match="no Orbax checkpoint"):
+        weights.load_orbax(tmp_path / "circle")

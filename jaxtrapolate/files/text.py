@@ -14,7 +14,7 @@ from jaxtrapolate.files.sequence import InputError
 LARGEST = 1 << 20
 """Bytes: no file of settings is larger."""
 _DEEPEST = 64
-_LONG_KEY = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){65}""")
+_LONG_KEY = re.compile(r"""(?m)(?:^|[\[{,])[ \t]*(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){65}""")
 """A key of more than 64 parts, which takes tomllib a time that grows with the square of them."""
 
 
