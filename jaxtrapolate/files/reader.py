@@ -128,14 +128,14 @@ class FileSequence(Sequence):
         return self._load(number)[1]
 
     def nonfinite(self, number: int) -> int:
-        """How many pixels of the frame had a non-finite value in some buffer."""
+        """How many pixels of the frame had a non-finite value in some buffer, or colour of alpha 0."""
         with self._lock:
             if number not in self._counts:
                 self._load(number)
             return self._counts[number]
 
     def invalid(self, number: int) -> np.ndarray | None:
-        """The pixels with a non-finite value in some buffer, bool `[H, W]`, or `None`."""
+        """The pixels with a non-finite value in some buffer, or colour of alpha 0, bool `[H, W]`, or `None`."""
         with self._lock:
             if self.nonfinite(number) == 0:
                 return None

@@ -116,12 +116,12 @@ class Sequence(abc.ABC):
         return None
 
     def invalid(self, number: int) -> np.ndarray | None:
-        """The pixels, bool `[H, W]`, that had a non-finite value in some buffer; `None` where there is none.
+        """The pixels, bool `[H, W]`, non-finite in some buffer or of alpha 0; `None` where there is none.
 
         They hold made-up values (`jaxtrapolate.files.repair`), so scores leave them out.
         """
         return None
 
     def nonfinite(self, number: int) -> int:
-        """How many pixels of the frame had a non-finite value in some buffer."""
+        """How many pixels of the frame had a non-finite value in some buffer, or alpha 0."""
         return 0
