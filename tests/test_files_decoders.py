@@ -149,6 +149,15 @@ def test_tiff_compressed_by_another_library(tmp_path):
     assert read_png(tmp_path / "p.tif").shape == (6, 5, 3)
 
 
+@pytest.mark.parametrize("name", ["a.bmp", "a.tga", "a.jpg"])
+def test_other_files_of_codes(tmp_path, name):
+    stored = np.full((6, 5, 3), (200, 100, 50), np.uint8)
+    Image.fromarray(stored).save(tmp_path / name, **({"quality": 100, "subsampling": 0} if name == "a.jpg" else {}))
+    read = read_png(tmp_path / name)
+    np.testing.assert_allclose(read.astype(int), stored, atol=2 if name == "a.jpg" else 0)
+    assert image_header(tmp_path / name).size == (6, 5)
+
+
 def test_integers_of_a_tiff_are_ids(tmp_path):
     path = folder(tmp_path / "ids", '[buffers]\nstencil = "{frame}.tif"\n')
     Image.fromarray(np.full((4, 4), 614300, np.int32)).save(path / "1.tif")
