@@ -6,6 +6,7 @@ import io
 import json
 import os
 import pickle
+import shutil
 import sys
 import zipfile
 
@@ -15,66 +16,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch_files import Named, Writer, pickled, tensor, write
 
 from jaxtrapolate import weights
 from jaxtrapolate.files import InputError
+from jaxtrapolate.methods.extranet import load_extranet
 from jaxtrapolate.weights.pickled import read_pickle
 from jaxtrapolate.weights.tree import nested
-
-# Checkpoints as PyTorch writes them, made with zipfile and pickle alone: stand-ins carry PyTorch's names.
-
-
-class Named:
-    """Pickles as the global module.name, as it is or called with arguments."""
-
-    def __init__(self, module, name, *arguments, called=True):
-        self.place, self.arguments, self.called = (module, name), arguments, called
-
-
-class Stored:
-    """Pickles as the persistent reference to a storage."""
-
-    def __init__(self, kind, key, count):
-        self.kind, self.key, self.count = kind, key, count
-
-
-class Writer(pickle._Pickler):
-    """Python's own pickler, with PyTorch's persistent references and globals that need not exist."""
-
-    def persistent_id(self, value):
-        if isinstance(value, Stored):
-            return ("storage", Named("torch", value.kind, called=False), value.key, "cuda:0", value.count)
-        return None
-
-    def save(self, value, save_persistent_id=True):
-        if not isinstance(value, Named):
-            return super().save(value, save_persistent_id)
-        self.write(b"c" + "\n".join(value.place).encode() + b"\n")
-        if value.called:
-            self.save(tuple(value.arguments))
-            self.write(b"R")
-        return None
-
-
-def pickled(value, protocol=2):
-    buffer = io.BytesIO()
-    Writer(buffer, protocol).dump(value)
-    return buffer.getvalue()
-
-
-def tensor(kind, key, count, offset, shape, strides, function="_rebuild_tensor_v2"):
-    rest = (False, collections.OrderedDict()) if function.endswith("v2") else ()
-    return Named("torch._utils", function, Stored(kind, key, count), offset, shape, strides, *rest)
-
-
-def write(path, value, storages=None, *, root="archive", compression=zipfile.ZIP_STORED, more=()):
-    with zipfile.ZipFile(path, "w", compression) as archive:
-        archive.writestr(f"{root}/data.pkl", value if isinstance(value, bytes) else pickled(value))
-        for key, content in (storages or {}).items():
-            archive.writestr(f"{root}/data/{key}", content)
-        for name, content in (("version", b"3\n"), *more):
-            archive.writestr(f"{root}/{name}", content)
-    return path
 
 
 @pytest.mark.parametrize(
@@ -569,6 +517,82 @@ def test_default_weights(tmp_path, monkeypatch):
         weights.default_weights("extranet")
 
 
+def _npz(folder, members):
+    """A file of weights with the right hash, whose members are these bytes."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    path = folder / f"a-{hashlib.sha256(buffer.getvalue()).hexdigest()[:8]}.npz"
+    path.write_bytes(buffer.getvalue())
+    return path
+
+
+def _array(header):
+    return b"\x93NUMPY\x01\0" + len(header).to_bytes(2, "little") + header
+
+
+HEADERS = {
+    "brackets": b"{'descr': " + b"(" * 300 + b")" * 300 + b"}\n",
+    "no end": b"{'descr': \"\"\"<f4, 'shape': (3,\n",
+    "zeros": bytes(100),
+    "number": b"{'descr': '<f4', 'fortran_order': False, 'shape': (" + b"9" * 5000 + b",)}\n",
+    "large": b"{'descr': '<f4', 'fortran_order': False, 'shape': (4000000000000,)}\n",
+}
+
+
+@pytest.mark.parametrize("case", sorted(HEADERS))
+def test_damaged_headers_of_arrays(tmp_path, case):
+    path = _npz(tmp_path, {"a.npy": _array(HEADERS[case])})
+    with pytest.raises(ValueError, match="no weights of this library") as error:
+        weights.load_weights(path)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+def test_nested_metadata(tmp_path):
+    text = b'{"method": "a", "note": "", "config": ' + b'{"a":' * 100_000 + b"1" + b"}" * 100_000 + b"}"
+    header = f"{{'descr': '|S{len(text)}', 'fortran_order': False, 'shape': ()}}\n".encode()
+    path = _npz(tmp_path, {"__metadata__.npy": _array(header) + text})
+    with pytest.raises(ValueError, match="no weights of this library"):
+        weights.load_weights(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+@pytest.mark.parametrize("name", ["a-12345678.npz", "a.pth.tar"])
+def test_only_regular_files_are_weights(tmp_path, name):
+    read = weights.load_weights if name.endswith("npz") else weights.read_torch
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(OSError, match="is a named pipe, not a regular file"):
+        read(tmp_path / name)
+    (tmp_path / name).unlink()
+    (tmp_path / name).symlink_to("/dev/zero")
+    with pytest.raises(OSError, match="is a device, not a regular file"):
+        read(tmp_path / name)
+    (tmp_path / name).unlink()
+    (tmp_path / name).symlink_to(name)
+    with pytest.raises(OSError, match="symbolic links"):
+        read(tmp_path / name)
+
+
+def test_lines_about_names_that_are_no_utf8(tmp_path):
+    path = os.path.join(tmp_path, os.fsdecode(b"caf\xe9\n-12345678.npz"))
+    with open(path, "wb") as file:
+        file.write(b"nothing")
+    for read in (weights.load_weights, weights.read_torch):
+        with pytest.raises(ValueError, match=r"caf\\udce9\\n-12345678\.npz: ") as error:
+            read(path)
+        str(error.value).encode("utf-8")
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("state", [[], {1: 2}, {"a": 3}, None, {"a": [1]}])
+def test_a_state_dict_that_is_none(tmp_path, state):
+    path = write(tmp_path / "a.pth.tar", {"state_dict": state})
+    with pytest.raises(ValueError, match=r"a\.pth\.tar: no weights of ExtraNet: .*(no table of arrays|is no array)"):
+        load_extranet(path)
+
+
 # Orbax
 
 
@@ -613,3 +637,18 @@ def test_other_folders_are_no_checkpoints(orbax, tmp_path):
     (tmp_path / "_METADATA").write_text("{}")
     with pytest.raises(ValueError, match="damaged Orbax checkpoint"):
         weights.load_orbax(tmp_path)
+
+
+def test_pipes_devices_and_circles_in_a_checkpoint(orbax, tmp_path):
+    shutil.copytree(orbax / "plain", tmp_path / "pipe")
+    os.mkfifo(tmp_path / "pipe" / "more")
+    with pytest.raises(ValueError, match=r"damaged Orbax checkpoint \(more is no regular file\)"):
+        weights.load_orbax(tmp_path / "pipe")
+    shutil.copytree(orbax / "plain", tmp_path / "device")
+    (tmp_path / "device" / "_METADATA").unlink()
+    (tmp_path / "device" / "_METADATA").symlink_to("/dev/zero")
+    with pytest.raises(ValueError, match="no Orbax checkpoint"):
+        weights.load_orbax(tmp_path / "device")
+    (tmp_path / "circle").symlink_to("circle")
+    with pytest.raises(ValueError, match="no Orbax checkpoint"):
+        weights.load_orbax(tmp_path / "circle")

@@ -1,4 +1,9 @@
-"""Sequences of frames in files: finding the reader, gaps in the numbering, reading ahead, and writing."""
+"""Sequences of frames in files: finding the reader, gaps in the numbering, reading ahead, and writing.
+
+Which image files are read, and what their numbers mean, is in `decoders` and `exr`; what alpha does in `alpha`. Files
+are opened where they are regular ones (`regular`) and hold no more pixels than the environment variable
+`JAXTRAPOLATE_MAX_PIXELS` allows, by default 40 million (`limits`).
+"""
 
 import itertools
 import os
@@ -43,7 +48,8 @@ def open_sequence(
         motion: how the motion vectors are stated, e.g. "current_minus_previous,pixels,up"; what a text does not say
             is the TOML file's, or the reader's default. Goes before the TOML file.
         settings: the TOML file, where it is not `jaxtrapolate.toml` in the folder.
-        strict: refuse gaps in the numbering now, and a frame with a non-finite pixel when it is read.
+        strict: refuse gaps in the numbering now, and a frame with a pixel that is not finite, or of alpha 0, when it is
+            read.
 
     Raises:
         InputError: one line that names the file and the remedy: no such folder, a file, an empty folder, nothing that

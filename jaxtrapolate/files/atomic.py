@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
+from jaxtrapolate.files.regular import NotRegularError
 from jaxtrapolate.files.sequence import InputError
 
 Action = Literal["read", "write"]
@@ -22,6 +23,7 @@ _REMEDIES = {
     errno.EROFS: "cannot be written, the file system is read-only; choose another place",
     errno.ENOSPC: "cannot be written, the disk is full; free some space and run again",
     errno.EDQUOT: "cannot be written, the disk quota is used up; free some space and run again",
+    errno.ELOOP: "is a symbolic link that leads back to itself; correct the link",
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
     errno.EMFILE: "too many open files; raise the limit (ulimit -n)",
     errno.ELOOP: "is a symbolic link that leads back to itself; give the folder that it should lead to",
@@ -31,6 +33,8 @@ _REMEDIES = {
 
 def os_input_error(path: str | os.PathLike[str], error: OSError, *, action: Action = "read") -> InputError:
     """The `InputError` that says in one line what an `OSError` on `path` means and what to do about it."""
+    if isinstance(error, NotRegularError):
+        return InputError(f"{path}: {error.strerror}; give a regular file")
     remedy = _REMEDIES.get(error.errno or 0, f"cannot be {'read' if action == 'read' else 'written'} ({{error}})")
     text = remedy.format(action=action, error=error.strerror or " ".join(str(error).split()))
     return InputError(f"{path}: {text}")

@@ -5,7 +5,8 @@ In a file of several parts the part's name is put before it where it is not ther
 a channel "Z" gives "depth.Z" as the layer "depth" of a single part would.
 
 Images are placed in the display window: pixels outside the data window are 0, pixels of the data window outside the
-display window (overscan) are left out. OpenEXR is imported when a file is read or written, not before.
+display window (overscan) are left out. OpenEXR is imported when a file is read or written, not before. Images larger
+than `jaxtrapolate.files.limits` says are refused.
 """
 
 import errno
@@ -18,8 +19,9 @@ import numpy as np
 
 from jaxtrapolate.checks import check_choice
 from jaxtrapolate.files.atomic import atomic_path, os_input_error
-from jaxtrapolate.files.exr_header import ExrPart, read_header
+from jaxtrapolate.files.exr_header import ExrPart, check_limits, read_header
 from jaxtrapolate.files.sequence import InputError
+from jaxtrapolate.files.silence import silence
 
 Compression = Literal["none", "rle", "zips", "zip", "piz"]
 HALF_MAX = 65504.0
@@ -48,7 +50,9 @@ def _openexr(path: str | os.PathLike[str]) -> Any:
 
 def exr_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """`(H, W)` of the display window, from the header alone; raises `InputError` where the file is not whole."""
-    return read_header(path)[0].size
+    parts = read_header(path)
+    check_limits(path, parts)
+    return parts[0].size
 
 
 def exr_channels(path: str | os.PathLike[str]) -> tuple[str, ...]:
@@ -70,9 +74,10 @@ def read_exr(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
     Raises:
         InputError: missing, no permission, not an EXR, truncated or damaged, deep or subsampled, parts of different
-            sizes, or OpenEXR not installed.
+            sizes, too large, or OpenEXR not installed. Nothing is printed.
     """
     parts = read_header(path)
+    check_limits(path, parts)
     for part in parts:
         if part.storage.startswith("deep"):
             raise InputError(f"{path}: deep EXR files cannot be read; flatten it to one sample a pixel")
@@ -83,13 +88,13 @@ def read_exr(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     library = _openexr(path)
     channels: dict[str, np.ndarray] = {}
     try:
-        with library.File(os.fspath(path), separate_channels=True) as file:
+        with silence(), library.File(os.fsencode(path), separate_channels=True) as file:
             if len(file.parts) != len(parts):  # The library drops a part that it cannot decode, and only prints.
                 raise RuntimeError("a part cannot be decoded")
             for part, stored in zip(parts, file.parts, strict=True):
                 for channel in stored.channels.values():
                     channels[_full_name(part, channel.name, parts)] = _place(channel.pixels, part)
-    except (RuntimeError, ValueError, TypeError, MemoryError) as error:
+    except Exception as error:  # What the library raises on damaged bytes is not documented.
         raise InputError(f"{path}: damaged, its pixels cannot be read; render or copy it again") from error
     return channels
 
@@ -164,7 +169,13 @@ def pick(
     if len(names) < count:
         have = ", ".join(stored)
         raise InputError(f"{path}: needs {wanted}, has {have}; name the layer and channels in a jaxtrapolate.toml")
-    return np.stack([stored[name].astype(np.float32) for name in names[:count]], axis=-1)
+    return quiet(np.stack([stored[name].astype(np.float32) for name in names[:count]], axis=-1))
+
+
+def quiet(image: np.ndarray) -> np.ndarray:
+    """A float image with quiet NaNs, in place: those that signal warn in the arithmetic of every later step."""
+    with np.errstate(invalid="ignore"):
+        return np.multiply(image, image.dtype.type(1), out=image)
 
 
 def write_exr(
@@ -196,7 +207,7 @@ def write_exr(
     channels = {name: _encode(plane, half) for name, plane in _planes(image).items()}
     with atomic_path(path) as temporary:
         try:
-            library.File(header, channels).write(os.fspath(temporary))
+            library.File(header, channels).write(os.fsencode(temporary))
             read_header(temporary)  # A disk that fills up while the file is closed goes unnoticed otherwise.
         except (RuntimeError, InputError) as error:
             raise _write_error(path, error) from error

@@ -14,11 +14,15 @@ from typing import BinaryIO
 import numpy as np
 
 from jaxtrapolate.files.atomic import os_input_error
+from jaxtrapolate.files.limits import check_claim, check_pixels
+from jaxtrapolate.files.regular import open_regular
 from jaxtrapolate.files.sequence import InputError
 
 _MAGIC = 20000630
 _TILED, _DEEP, _MULTIPART = 0x200, 0x800, 0x1000
 _LARGEST_HEADER = 1 << 26
+_FARTHEST = 1 << 24
+_LARGEST_PARTS = 1024
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +50,7 @@ def read_header(path: str | os.PathLike[str]) -> tuple[ExrPart, ...]:
         InputError: missing, no permission, not an EXR, truncated, never finished, or a damaged header.
     """
     try:
-        with open(path, "rb") as stream:
+        with open_regular(path) as stream:
             length = os.fstat(stream.fileno()).st_size
             data = stream.read(1 << 16)
             if len(data) < 8 or struct.unpack_from("<I", data)[0] != _MAGIC:
@@ -63,6 +67,24 @@ def read_header(path: str | os.PathLike[str]) -> tuple[ExrPart, ...]:
     except (IndexError, ValueError, KeyError, struct.error) as error:
         raise InputError(f"{path}: truncated or damaged in its header; render or copy it again") from error
     return parts
+
+
+def check_limits(path: str | os.PathLike[str], parts: tuple[ExrPart, ...]) -> None:
+    """Raise `InputError` where the windows that a header states, with all channels, exceed `jaxtrapolate.files.limits`.
+
+    The display window is what is asked for when channels are put into it, the data window what the library asks for.
+    """
+    channels = sum(len(part.channels) for part in parts)
+    claimed = 0
+    for part in parts:
+        check_pixels(path, *part.size, channels)
+        x0, y0, x1, y1 = part.data
+        check_pixels(path, y1 - y0 + 1, x1 - x0 + 1, channels)
+        claimed += (y1 - y0 + 1) * (x1 - x0 + 1) * len(part.channels) * 2
+        if max(map(abs, part.data + part.display)) > _FARTHEST:
+            text = f"its windows {part.display} and {part.data} lie more than {_FARTHEST} pixels away"
+            raise InputError(f"{path}: {text}; render or copy it again")
+    check_claim(path, claimed, os.stat(path).st_size)
 
 
 def _parse(data: bytes) -> tuple[tuple[ExrPart, ...], int]:
@@ -86,6 +108,8 @@ def _parse(data: bytes) -> tuple[tuple[ExrPart, ...], int]:
             return tuple(parts), position
         if not data[position]:
             return tuple(parts), position + 1
+        if len(parts) >= _LARGEST_PARTS:
+            raise ValueError("parts")
 
 
 def _string(data: bytes, position: int) -> tuple[str, int]:
@@ -102,6 +126,8 @@ def _part(attributes: dict[str, bytes], flags: int) -> ExrPart:
         subsampled = subsampled or sampling != (1, 1)
         names.append(name)
         position += 16
+    if len(set(names)) < len(names):
+        raise ValueError("channels")
     display: tuple[int, int, int, int] = struct.unpack("<4i", attributes["displayWindow"])
     if display[2] < display[0] or display[3] < display[1]:
         raise ValueError("displayWindow")

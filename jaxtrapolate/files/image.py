@@ -1,30 +1,36 @@
-"""8-bit images (PNG), and one function that writes a frame as its input was: EXR for HDR, PNG for 8-bit."""
+"""Images that are no EXR: read by what they hold, and one function that writes a frame as its input was.
+
+What is read is in `jaxtrapolate.files.decoders`; written are EXR for HDR and PNG for 8-bit.
+"""
 
 import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
-from jaxtrapolate.files.atomic import atomic_path, os_input_error
+from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.files.decoders import ImageHeader, decode
 from jaxtrapolate.files.exr import write_exr
 from jaxtrapolate.files.sequence import InputError
 
 _MODES = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}
 
 
-def _curve() -> np.ndarray:
-    """The linear value of every 8-bit sRGB code (IEC 61966-2-1), float32 `[256]`."""
-    code = np.arange(256) / 255.0
+def _curve(largest: int) -> np.ndarray:
+    """The linear value of every sRGB code from 0 to `largest` (IEC 61966-2-1), float32."""
+    code = np.arange(largest + 1) / float(largest)
     return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
-_LINEAR = _curve()
+_LINEAR = _curve(255)
 
 
 def decode_srgb(codes: np.ndarray) -> np.ndarray:
-    """Linear float32 values of 8-bit sRGB codes, by the exact curve; `encode_srgb` gives the codes back."""
+    """Linear float32 values of 8-bit or 16-bit sRGB codes, by the exact curve; `encode_srgb` gives 8-bit ones back."""
+    if codes.dtype == np.uint16:
+        return _curve(65535)[codes]
     return _LINEAR[codes]
 
 
@@ -36,44 +42,39 @@ def encode_srgb(linear: Any) -> np.ndarray:
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """`(H, W)` of a PNG (or any file that Pillow reads), from its header alone."""
-    try:
-        with Image.open(path) as image:
-            return image.height, image.width
-    except (OSError, SyntaxError, ValueError) as error:
-        raise _read_error(path, error) from error
+    """`(H, W)` of an image file, from its header alone."""
+    return image_header(path).size
+
+
+def image_header(path: str | os.PathLike[str]) -> ImageHeader:
+    """Size, channels, type and alpha of an image file, from its header alone; raises `InputError` as `read_image`."""
+    return decode(path, pixels=False)[0]
+
+
+def read_image(path: str | os.PathLike[str]) -> tuple[ImageHeader, np.ndarray]:
+    """An image file's header, and its pixels `[H, W, C]` in the type they are stored in, alpha as the last channel.
+
+    Raises:
+        InputError: missing, no permission, no regular file, of a kind that is not read, truncated or damaged, too
+            large, of several pictures, or in other colours than grey and RGB.
+    """
+    header, pixels = decode(path)
+    assert pixels is not None
+    return header, pixels
 
 
 def read_png(path: str | os.PathLike[str]) -> np.ndarray:
-    """The stored codes `[H, W, C]` of a PNG (or any file that Pillow reads): uint8, or uint16 where it has 16 bits.
+    """The stored codes `[H, W, C]` of a PNG, or of another image file of codes: uint8, or uint16 where it has 16 bits.
 
     Palettes are resolved to RGB or RGBA; a black-and-white image becomes 0 and 255.
 
     Raises:
-        InputError: missing, no permission, not an image, or truncated.
+        InputError: as `read_image`; and an image of other numbers than codes of 8 or 16 bits.
     """
-    try:
-        with Image.open(path) as image:
-            if image.mode == "P":
-                image = image.convert("RGBA" if "transparency" in image.info else "RGB")
-            elif image.mode == "1":
-                image = image.convert("L")
-            codes = np.array(image)
-    except (OSError, SyntaxError, ValueError) as error:
-        raise _read_error(path, error) from error
-    if codes.dtype == np.int32:  # Pillow's mode I, which it uses for some 16-bit files.
-        codes = codes.astype(np.uint16)
-    if codes.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{path}: pixels of type {codes.dtype} cannot be read; store it as an 8-bit PNG or as EXR")
-    return codes if codes.ndim == 3 else codes[..., None]
-
-
-def _read_error(path: str | os.PathLike[str], error: Exception) -> InputError:
-    if isinstance(error, OSError) and error.errno is not None:
-        return os_input_error(path, error)
-    if isinstance(error, UnidentifiedImageError):
-        return InputError(f"{path}: not an image; render or copy it again")
-    return InputError(f"{path}: truncated or damaged; render or copy it again")
+    header, pixels = read_image(path)
+    if not header.codes:
+        raise InputError(f"{path}: holds values of {header.dtype}, where 8-bit or 16-bit codes are needed")
+    return pixels
 
 
 def write_png(path: str | os.PathLike[str], codes: Any) -> None:

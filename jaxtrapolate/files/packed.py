@@ -17,8 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxtrapolate.files.alpha import without_empty
 from jaxtrapolate.files.image import decode_srgb, read_png
-from jaxtrapolate.files.reader import FileSequence, Opened, list_folder
+from jaxtrapolate.files.reader import FileSequence, Opened, frame_number, list_folder
 from jaxtrapolate.files.sequence import InputError, MotionConvention
 
 FOLDERS = ("color", "motion", "depth", "stencil", "shadow")
@@ -73,7 +74,7 @@ class PackedSequence(FileSequence):
         for buffer in FOLDERS:
             for name in list_folder(clip / buffer) if (clip / buffer).is_dir() else ():
                 if match := _FILE.fullmatch(name):
-                    files.setdefault(int(match[1]), {})[buffer] = os.path.join(buffer, name)
+                    files.setdefault(frame_number(match[1], name), {})[buffer] = os.path.join(buffer, name)
         if not files:
             raise InputError(f"{clip}: its folders hold no files named NNNN.png; give the folder of the clip")
         super().__init__(
@@ -92,9 +93,10 @@ class PackedSequence(FileSequence):
         if codes.dtype != np.uint8 or codes.shape[-1] < channels:
             got = f"{codes.shape[-1]} channels of {codes.dtype}"
             raise InputError(f"{path}: {got}, a packed {buffer} has {channels} of uint8; store it as such")
+        alpha = codes[..., channels] if codes.shape[-1] > channels else None
         codes = codes[..., :channels]
         if buffer == "color":
-            return decode_srgb(codes)
+            return without_empty(decode_srgb(codes), alpha)
         if buffer == "motion":
             return decode_motion(codes)
         if buffer == "depth":

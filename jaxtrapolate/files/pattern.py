@@ -3,7 +3,7 @@
 A full example, for a multi-layer render with PNG masks beside it:
 
     name = "courtyard"                # for reports; by default the folder's name
-    hdr = true                        # colour is HDR; by default where the colour is an EXR
+    hdr = true                        # colour is HDR; by default where the colour is an EXR or other values
     depth = "metric"                  # in the unit of position, or "ordinal": only larger = farther
 
     [motion]                          # how motion vectors are stated; what is left out: the library's convention
@@ -30,11 +30,23 @@ table with `file` and some of
 - `scale`, `offset`: the value is stored * scale + offset, e.g. 2 and -1 for normals in a PNG.
 - `invert`: 1 - value, after scale and offset: masks of the other polarity, ordinal depth that is larger when nearer.
 - `above`: 1 where the stored value is above this number, else 0; scale, offset and invert do not apply.
-- `srgb`: decode 8-bit codes to linear; by default for `color` alone.
+- `srgb`: decode codes of 8 or 16 bits to linear; by default for `color` alone.
+- `codes`: take the codes of an image of 8 or 16 bits as they are stored, not as 0..1, before scale and offset.
+- `valid`: a channel of the file that is 0 where it holds no value: there the buffer is not finite, so the pixel is
+  counted and becomes a hole.
+
+So this reads motion in the encoding of the KITTI benchmark, PNG files of 16 bits with u = (R - 2^15) / 64, v likewise
+from G, and B = 0 where nothing was measured (`[motion]` says what u and v mean):
+
+    motion = { file = "{frame:06d}_10.png", codes = true, scale = 0.015625, offset = -512, valid = "B" }
 
 A pattern is a path relative to the folder with one `{frame}` in the file's name, with leading zeros as in
-`{frame:04d}`. Codes of PNG files become 0..1, save for a stencil's, which are ids. Flows are in the library's own
-convention, their third channel in the unit of position. Depth +inf is the sky (`jaxtrapolate.files.repair`).
+`{frame:04d}`. Codes of images (PNG and others, of 8 or 16 bits) become 0..1, save for a stencil's, which are ids; other
+numbers (TIFF of 32 bits or floats, Radiance HDR, `.flo`, `.npy`) are values as they are stored, and never sRGB;
+`jaxtrapolate.files.decoders` lists the files. Their channels are named Y, RG, RGB by their number, and A is alpha; more
+than four are named "0", "1" and so on. Colour with alpha 0 is a hole (`jaxtrapolate.files.alpha`). Flows are in the
+library's own convention, their third channel in the unit of position. Depth +inf is the sky
+(`jaxtrapolate.files.repair`).
 
 For the other readers the same file may hold `[motion]` alone: there, what it leaves out keeps the reader's own default.
 """
@@ -42,23 +54,26 @@ For the other readers the same file may hold `[motion]` alone: there, what it le
 import dataclasses
 import os
 import re
-import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
-from jaxtrapolate.files.atomic import os_input_error
-from jaxtrapolate.files.exr import pick, read_exr
-from jaxtrapolate.files.image import decode_srgb, read_png
-from jaxtrapolate.files.reader import BUFFERS, FileSequence, Opened, list_folder
+from jaxtrapolate.files.alpha import without_empty
+from jaxtrapolate.files.decoders import ImageHeader
+from jaxtrapolate.files.exr import pick, quiet, read_exr
+from jaxtrapolate.files.image import decode_srgb, image_header, read_image
+from jaxtrapolate.files.reader import BUFFERS, FileSequence, Opened, frame_number, list_folder
 from jaxtrapolate.files.sequence import InputError, MotionConvention
+from jaxtrapolate.files.text import read_toml
 from jaxtrapolate.motion import Sign, Units, YAxis
 
 SETTINGS_NAME = "jaxtrapolate.toml"
 """The name of the TOML file in a folder of frames."""
 
+_LARGEST_NUMBER = float(np.finfo(np.float32).max)
+_MOST_DIGITS = 15
 _FIELD = re.compile(r"\{frame(?::0?(\d*)d)?\}")
 
 
@@ -74,6 +89,8 @@ class Buffer:
     invert: bool = False
     above: float | None = None
     srgb: bool = False
+    codes: bool = False
+    valid: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,12 +116,7 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
         InputError: missing, not TOML, an unknown key or a value of the wrong kind, named.
     """
     path = Path(path)
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise os_input_error(path, error) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML, {' '.join(str(error).split())}; correct it") from error
+    content = read_toml(path)
     kinds = {"name": _text, "hdr": _flag, "depth": _choice("metric", "ordinal"), "motion": _table, "buffers": _table}
     content = _checked(path, "", content, kinds)
     motion = _checked(
@@ -155,7 +167,13 @@ _text = _instance(str, "a text")
 _flag = _instance(bool, "true or false")
 _table = _instance(dict, "a table")
 _text_or_table = _instance((str, dict), "a pattern or a table")
-_number = _instance((int, float), "a number")
+_any_number = _instance((int, float), "a number")
+
+
+def _number(value: Any) -> Any:
+    if not abs(_any_number(value)) <= _LARGEST_NUMBER:  # no NaN either
+        raise ValueError("a finite number that 32 bits hold")
+    return value
 
 
 def _channels(value: Any) -> tuple[str, ...]:
@@ -167,6 +185,9 @@ def _channels(value: Any) -> tuple[str, ...]:
 def _pattern(value: Any) -> str:
     if not isinstance(value, str) or len(_FIELD.findall(value)) != 1 or not _FIELD.search(os.path.basename(value)):
         raise ValueError("a path with one {frame} or {frame:04d} in the file's name")
+    digits = _FIELD.findall(value)[0].lstrip("0")
+    if len(digits) > 2 or int(digits or 0) > _MOST_DIGITS:
+        raise ValueError(f"a frame's number of at most {_MOST_DIGITS} digits")
     return value
 
 
@@ -180,6 +201,8 @@ def _buffer(path: Path, name: str, value: str | dict[str, Any]) -> Buffer:
         "invert": _flag,
         "above": _number,
         "srgb": _flag,
+        "codes": _flag,
+        "valid": _text,
     }
     table = _checked(path, f"buffers.{name}.", {"file": value} if isinstance(value, str) else value, kinds)
     if "file" not in table:
@@ -218,11 +241,13 @@ class PatternSequence(FileSequence):
             raise InputError(f"{settings.path}: names no buffers; add a table [buffers]")
         self._buffers = settings.buffers
         color = settings.buffers.get("color")
+        files = _find(Path(folder), settings)
+        self._color_layer = "" if color is None else color.layer
         super().__init__(
             folder,
-            _find(Path(folder), settings),
+            files,
             name=settings.name or Path(folder).resolve().name,
-            hdr=settings.hdr if settings.hdr is not None else color is None or _is_exr(color.file),
+            hdr=settings.hdr if settings.hdr is not None else _holds_values(Path(folder), files),
             depth=settings.depth,
             convention=motion or settings.convention(MotionConvention()),
             strict=strict,
@@ -231,14 +256,18 @@ class PatternSequence(FileSequence):
     def _read(self, path: Path, buffer: str, opened: Opened) -> np.ndarray:
         spec, count = self._buffers[buffer], BUFFERS[buffer]
         name = str(path)
+        if name not in opened:
+            opened[name] = read_exr(path) if _is_exr(name) else read_image(path)
         if _is_exr(name):
-            if name not in opened:
-                opened[name] = read_exr(path)
             image = pick(opened[name], path=path, count=count, layer=spec.layer, channels=spec.channels)
+            if spec.valid:
+                valid = pick(opened[name], path=path, count=1, layer=spec.layer, channels=[spec.valid])[..., 0]
+                image = without_empty(image, valid)
+            if buffer == "color":
+                image = self._exr_color(path, image, opened[name])
         else:
-            if name not in opened:
-                opened[name] = read_png(path)
-            image = _values(path, opened[name], buffer, spec)
+            header, pixels = opened[name]
+            image = _values(path, header, pixels, buffer, spec)
         if spec.above is not None:
             return (image > spec.above).astype(np.float32)
         if (spec.scale, spec.offset) != (1.0, 0.0):
@@ -251,21 +280,39 @@ def _is_exr(name: str) -> bool:
     return name.lower().endswith(".exr")
 
 
-def _values(path: Path, codes: np.ndarray, buffer: str, spec: Buffer) -> np.ndarray:
-    """The float32 values of a PNG's codes, `[H, W, count]`."""
+def _holds_values(folder: Path, files: Mapping[int, Mapping[str, str]]) -> bool:
+    """Whether the first colour there is holds values, not codes; true where there is none."""
+    color = next((buffers["color"] for _, buffers in sorted(files.items()) if "color" in buffers), None)
+    return color is None or _is_exr(color) or not image_header(folder / color).codes
+
+
+def _values(path: Path, header: ImageHeader, pixels: np.ndarray, buffer: str, spec: Buffer) -> np.ndarray:
+    """The float32 values of an image that is no EXR, `[H, W, count]`."""
     count = BUFFERS[buffer]
-    available = "Y" if codes.shape[-1] <= 2 else "RGBA"
-    names = spec.channels or tuple(available[:count])
-    places = [available[: codes.shape[-1]].find(name) if len(name) == 1 else -1 for name in names]
-    if len(places) < count or min(places) < 0:
-        have = ", ".join(available[: codes.shape[-1]])
-        raise InputError(f"{path}: {buffer} needs {count} channels ({', '.join(names)}), has {have}; correct the TOML")
-    codes = codes[..., places]
-    if buffer == "stencil":
-        return codes.astype(np.float32)
-    if spec.srgb and codes.dtype == np.uint8:
-        return decode_srgb(codes)
-    return codes.astype(np.float32) / np.float32(np.iinfo(codes.dtype).max)
+    names = _names(header)
+    wanted = spec.channels or tuple(names[: count if names[:1] != ["Y"] else 1])
+    places = [names.index(name) if name in names else -1 for name in (*wanted, *([spec.valid] if spec.valid else []))]
+    if len(wanted) < count or min(places) < 0:
+        have = ", ".join(names)
+        raise InputError(f"{path}: {buffer} needs {count} channels ({', '.join(wanted)}), has {have}; correct the TOML")
+    stored = pixels[..., places[: len(wanted)]]
+    if buffer == "stencil" or spec.codes or not header.codes:
+        with np.errstate(over="ignore", invalid="ignore"):
+            image = quiet(stored.astype(np.float32))
+    elif spec.srgb:
+        image = decode_srgb(stored)
+    else:
+        image = stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+    if spec.valid:
+        image = without_empty(image, pixels[..., places[-1]])
+    return without_empty(image, pixels[..., -1]) if buffer == "color" and header.alpha else image
+
+
+def _names(header: ImageHeader) -> list[str]:
+    """The names of an image's channels; see the module's docstring."""
+    if header.channels > 4:
+        return [str(k) for k in range(header.channels)]
+    return list("YA" if header.alpha and header.channels == 2 else (" Y", "Y", "RG", "RGB", "RGBA")[header.channels])
 
 
 def _find(folder: Path, settings: Settings) -> dict[int, dict[str, str]]:
@@ -279,7 +326,7 @@ def _find(folder: Path, settings: Settings) -> dict[int, dict[str, str]]:
         before, digits, after = _FIELD.split(base)
         number = rf"\d{{{int(digits)},}}" if digits else r"\d+"
         pattern = re.compile(rf"{re.escape(before)}({number}){re.escape(after)}")
-        found = [(int(match[1]), name) for name in listed[parent] if (match := pattern.fullmatch(name))]
+        found = [(frame_number(match[1], name), name) for name in listed[parent] if (match := pattern.fullmatch(name))]
         if not found:
             raise InputError(f"{folder}: no file for {buffer}, {spec.file}; correct the pattern in {settings.path}")
         for frame, name in found:

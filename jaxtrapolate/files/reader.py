@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxtrapolate.checks import Size
+from jaxtrapolate.files.alpha import UNWRITTEN_NOTE, alpha_note, exr_alpha, without_empty
 from jaxtrapolate.files.atomic import os_input_error
 from jaxtrapolate.files.convention import convert
 from jaxtrapolate.files.exr import exr_size
@@ -75,10 +76,31 @@ class FileSequence(Sequence):
         self.depth = depth if any("depth" in buffers for buffers in self._files.values()) else "absent"
         self.forward_motion = any("forward_flow" in buffers for buffers in self._files.values())
         self.size = self._check_sizes()
+        self._note_alpha()
         self._lock = threading.RLock()
         self._loaded: tuple[int, Frame, np.ndarray | None] | None = None
         self._counts: dict[int, int] = {}
         self._masks: collections.OrderedDict[int, np.ndarray] = collections.OrderedDict()
+
+    def _note_alpha(self) -> None:
+        """Say that colour has alpha, by the first file of colour."""
+        first = next((buffers["color"] for buffers in self._files.values() if "color" in buffers), None)
+        if first is not None and (note := alpha_note(self.folder / first, self._color_layer)):
+            self.notes = (*self.notes, note)
+
+    _color_layer = ""
+    """The layer of an EXR that colour is read from."""
+    _unwritten = False
+
+    def _exr_color(self, path: Path, color: np.ndarray, stored: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Colour of an EXR without the pixels of alpha 0 (`jaxtrapolate.files.alpha`)."""
+        alpha = exr_alpha(stored, self._color_layer)
+        if alpha is not None and not alpha.any():
+            if not self._unwritten:
+                self.notes = (*self.notes, UNWRITTEN_NOTE.format(name=path.name))
+            self._unwritten = True
+            return color
+        return without_empty(color, alpha)
 
     @abc.abstractmethod
     def _read(self, path: Path, buffer: str, opened: Opened) -> np.ndarray:
@@ -106,14 +128,14 @@ class FileSequence(Sequence):
         return self._load(number)[1]
 
     def nonfinite(self, number: int) -> int:
-        """How many pixels of the frame had a non-finite value in some buffer."""
+        """How many pixels of the frame had a non-finite value in some buffer, or colour of alpha 0."""
         with self._lock:
             if number not in self._counts:
                 self._load(number)
             return self._counts[number]
 
     def invalid(self, number: int) -> np.ndarray | None:
-        """The pixels with a non-finite value in some buffer, bool `[H, W]`, or `None`."""
+        """The pixels with a non-finite value in some buffer, or colour of alpha 0, bool `[H, W]`, or `None`."""
         with self._lock:
             if self.nonfinite(number) == 0:
                 return None
@@ -171,7 +193,7 @@ class FileSequence(Sequence):
             return
         if self.strict:
             remedy = "render it again, or read it without strict"
-            raise InputError(f"{self.folder}: frame {number} has {count} non-finite pixels; {remedy}")
+            raise InputError(f"{self.folder}: frame {number} has {count} non-finite pixels (or of alpha 0); {remedy}")
         self._masks[number] = np.packbits(invalid)
         while len(self._masks) > _MASKS_KEPT:
             self._masks.popitem(last=False)
@@ -197,8 +219,15 @@ class FileSequence(Sequence):
 
 
 def stored_size(path: Path) -> Size:
-    """`(H, W)` of an EXR or 8-bit image file, from its header alone."""
+    """`(H, W)` of an EXR or any other image file, from its header alone."""
     return exr_size(path) if path.suffix.lower() == ".exr" else image_size(path)
+
+
+def frame_number(digits: str, name: str) -> int:
+    """The number of a frame from the digits in a file's name; `InputError` where they are more than 15."""
+    if len(digits.lstrip("0")) > 15:
+        raise InputError(f"{name}: a frame's number of {len(digits)} digits; rename the file, 15 are the most")
+    return int(digits)
 
 
 def list_folder(folder: str | os.PathLike[str]) -> list[str]:

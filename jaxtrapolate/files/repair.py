@@ -5,6 +5,8 @@ A pixel is invalid when any of its stored buffers is NaN or infinite there, apar
 - depth +inf means that nothing was hit. It becomes `FAR`, and where there is no other mask of the sky, it is the mask.
 - position and normal may be anything at the sky; where they are not finite there, they become 0.
 
+Colour whose alpha is 0 comes here as NaN (`jaxtrapolate.files.alpha`), and so does what a file marks as not valid.
+
 In an invalid pixel
 
 - motion is NaN in both components: the warps treat it as "no vector", so the pixel is a hole of the target;

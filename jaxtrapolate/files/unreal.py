@@ -30,7 +30,7 @@ import numpy as np
 from jaxtrapolate.files.atomic import os_input_error
 from jaxtrapolate.files.convention import unconvert
 from jaxtrapolate.files.exr import pick, read_exr, write_exr
-from jaxtrapolate.files.reader import BUFFERS, FLOWS, FileSequence, Opened, list_folder
+from jaxtrapolate.files.reader import BUFFERS, FLOWS, FileSequence, Opened, frame_number, list_folder
 from jaxtrapolate.files.sequence import InputError, MotionConvention
 from jaxtrapolate.records import Frame, Keyframe, check_frame
 
@@ -72,7 +72,7 @@ def unreal_files(names: list[str]) -> dict[str, dict[int, dict[str, str]]]:
     scenes: dict[str, dict[int, dict[str, str]]] = {}
     for name in names:
         if match := _FILE.fullmatch(name):
-            files = scenes.setdefault(match["scene"], {}).setdefault(int(match["number"]), {})
+            files = scenes.setdefault(match["scene"], {}).setdefault(frame_number(match["number"], name), {})
             files[_LOWER[match["buffer"].lower()]] = name
     return scenes
 
@@ -117,7 +117,10 @@ class UnrealSequence(FileSequence):
         )
 
     def _read(self, path: Path, buffer: str, opened: Opened) -> np.ndarray:
-        image = pick(read_exr(path), path=path, count=BUFFERS[buffer])
+        stored = read_exr(path)
+        image = pick(stored, path=path, count=BUFFERS[buffer])
+        if buffer == "color":
+            return self._exr_color(path, image, stored)
         if buffer == "depth":
             with np.errstate(over="ignore"):  # The largest float stands for the sky, as +inf does.
                 image *= np.float32(_DEPTH_TO_CM)

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_choice
+from jaxtrapolate.files.sequence import printable
 from jaxtrapolate.gather import backward_warp
 from jaxtrapolate.holes import Taps
 from jaxtrapolate.methods.method import Method, Stage, Values, rendered
@@ -263,10 +265,15 @@ def load_extranet(path: str | PathLike[str]) -> tuple[ExtraNet, Preparation]:
     path = Path(path)
     if path.suffix != ".npz" and not path.is_dir():
         checkpoint = read_torch(path)
+        arrays = checkpoint.get("state_dict", checkpoint)
         try:
-            return extranet_from_torch(checkpoint.get("state_dict", checkpoint)), RELEASE
+            if not isinstance(arrays, dict) or not all(isinstance(name, str) for name in arrays):
+                raise ValueError("its state_dict is no table of arrays by name")
+            if wrong := [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]:
+                raise ValueError(f"{wrong[0]} is no array")
+            return extranet_from_torch(arrays), RELEASE
         except ValueError as error:
-            raise ValueError(f"{path}: no weights of ExtraNet: {error}") from error
+            raise ValueError(f"{printable(path)}: no weights of ExtraNet: {error}") from error
 
     def build(stated: Mapping[str, Any]):
         config = configured(ExtraNetConfig, stated.get("network", {}), source=str(path))

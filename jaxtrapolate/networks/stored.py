@@ -27,7 +27,7 @@ def load_network(
     """
     weights = read_weights(path)
     if weights.method not in (method, None):
-        raise ValueError(f"{path}: weights of method {weights.method!r}, expected {method!r}")
+        raise ValueError(f"{weights.source}: weights of method {weights.method!r}, expected {method!r}")
     structure, state = nnx.split(nnx.eval_shape(build(weights.config)))
-    nnx.replace_by_pure_dict(state, fit(nnx.to_pure_dict(state), weights.tree, source=str(path)))
+    nnx.replace_by_pure_dict(state, fit(nnx.to_pure_dict(state), weights.tree, source=weights.source))
     return nnx.merge(structure, state), weights.config

@@ -19,11 +19,10 @@ import types
 import typing
 from collections.abc import Mapping
 from importlib import resources
-from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from jaxtrapolate.files import InputError
-from jaxtrapolate.files.atomic import os_input_error
+from jaxtrapolate.files.text import read_toml
 from jaxtrapolate.training.tasks import Task, find_task
 
 T = TypeVar("T")
@@ -229,18 +228,19 @@ def load_config(name: str | os.PathLike[str], changes: Mapping[str, Any] | None 
     text = os.fspath(name)
     shipped = _shipped()
     try:
-        content = shipped[text].read_text() if text in shipped else Path(text).read_text(encoding="utf-8")
-        table = tomllib.loads(content)
+        table = tomllib.loads(shipped[text].read_text()) if text in shipped else _read_toml(text, shipped)
         for key, value in (changes or {}).items():
             _put(table, key, value)
         return parse_config(table)
-    except OSError as error:
-        if not text.endswith(".toml") and not Path(text).exists():
-            there = f"the shipped ones are {', '.join(shipped)}" if shipped else "none are shipped"
-            raise InputError(f"{text}: no such configuration or TOML file; {there}") from error
-        raise os_input_error(text, error) from error
-    except (ValueError, UnicodeDecodeError) as error:  # also what is no TOML
+    except (ValueError, OverflowError) as error:
         raise InputError(f"{text}: {error}") from error
+
+
+def _read_toml(text: str, shipped: Mapping[str, Any]) -> dict[str, Any]:
+    if not text.endswith(".toml") and not os.path.lexists(text):
+        there = f"the shipped ones are {', '.join(shipped)}" if shipped else "none are shipped"
+        raise InputError(f"{text}: no such configuration or TOML file; {there}")
+    return read_toml(text)
 
 
 def _put(table: dict[str, Any], key: str, value: Any) -> None:

@@ -4,7 +4,10 @@ import dataclasses
 import hashlib
 import io
 import json
+import math
+import os
 import re
+import stat
 import zipfile
 from collections.abc import Mapping
 from os import PathLike
@@ -15,13 +18,19 @@ import jax
 import numpy as np
 
 from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.files.regular import open_regular
+from jaxtrapolate.files.sequence import printable
+from jaxtrapolate.files.text import check_values
 from jaxtrapolate.weights.tree import named, nested
 
 LARGEST = 2_000_000
 """Bytes: no file of weights is larger."""
+LARGEST_CHECKPOINT = 1 << 28
+"""Bytes: no Orbax checkpoint is read whose arrays take more, or whose files do."""
 _METADATA = "__metadata__"
 _ORBAX = "_METADATA"  # the file that every pytree saved by Orbax has
 _NAME = re.compile(r"(?P<stem>.+)-(?P<hash>[0-9a-f]{8})\.npz")
+_STEP = re.compile("[0-9]{1,18}")
 _SHIPPED = Path(__file__).parent
 
 
@@ -97,22 +106,24 @@ def load_weights(path: str | PathLike[str]) -> Weights:
         OSError: the file cannot be read.
         ValueError: one line that names the file: a name without a hash, another hash, more than 2 MB, or no weights.
     """
-    path = Path(path)
-    size = path.stat().st_size
-    match = _NAME.fullmatch(path.name)
-    if match is None:
-        raise ValueError(f"{path}: expected a name that ends in the file's hash, as in extranet-1a2b3c4d.npz")
-    if size > LARGEST:
-        raise ValueError(f"{path}: {size} bytes, expected at most {LARGEST}")
-    content = path.read_bytes()
+    path, source = Path(path), printable(path)
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        match = _NAME.fullmatch(path.name)
+        if match is None:
+            raise ValueError(f"{source}: expected a name that ends in the file's hash, as in extranet-1a2b3c4d.npz")
+        content = file.read(LARGEST + 1)
+    if len(content) > LARGEST:
+        raise ValueError(f"{source}: {size} bytes, expected at most {LARGEST}")
     if (found := _hash(content)) != match["hash"]:
-        raise ValueError(f"{path}: damaged or changed: its hash is {found}, its name says {match['hash']}")
+        raise ValueError(f"{source}: damaged or changed: its hash is {found}, its name says {match['hash']}")
     try:
         arrays = _unpacked(content)
         metadata = json.loads(arrays.pop(_METADATA).item())
-        return Weights(**_stated(metadata), tree=nested(arrays), source=str(path))
-    except (ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: no weights of this library ({' '.join(str(error).split())})") from error
+        check_values(metadata)
+        return Weights(**_stated(metadata), tree=nested(arrays), source=source)
+    except Exception as error:  # what the parsers of zip, JSON and NumPy raise on damaged bytes is not documented
+        raise ValueError(printable(f"{source}: no weights of this library ({error})")) from error
 
 
 def load_orbax(directory: str | PathLike[str]) -> Weights:
@@ -130,26 +141,56 @@ def load_orbax(directory: str | PathLike[str]) -> Weights:
     import orbax.checkpoint as ocp
     from etils import epath
 
-    folder = Path(directory).resolve()
-    steps = [int(child.name) for child in folder.iterdir() if child.name.isdecimal()] if folder.is_dir() else []
-    folder = folder / str(max(steps)) if steps else folder
-    item = folder if (folder / _ORBAX).is_file() else folder / "weights"
-    if not (item / _ORBAX).is_file():
-        raise ValueError(f"{directory}: no Orbax checkpoint, or one without the item 'weights'")
+    source = printable(directory)
+    try:
+        folder = Path(directory).resolve()
+        steps = [child for child in folder.iterdir() if _STEP.fullmatch(child.name)] if folder.is_dir() else []
+        folder = max(steps, key=lambda child: int(child.name)) if steps else folder
+        item = folder if (folder / _ORBAX).is_file() else folder / "weights"
+        if not (item / _ORBAX).is_file():
+            raise ValueError(f"{source}: no Orbax checkpoint, or one without the item 'weights'")
+        _check_files(folder, source)
+    except (OSError, RuntimeError) as error:  # a link that leads back to itself is a RuntimeError
+        raise ValueError(printable(f"{source}: no Orbax checkpoint ({error})")) from error
     metadata: dict[str, Any] = {"method": None, "config": {}, "note": ""}
     try:  # by handlers: a checkpointer warns of every item that is not asked for
         handler = ocp.PyTreeCheckpointHandler()
-        kinds = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), handler.metadata(epath.Path(item)))
+        stated = handler.metadata(epath.Path(item))
+        sizes = [_bytes(leaf) for leaf in jax.tree.leaves(getattr(stated, "tree", stated))]
+        if sum(sizes) > LARGEST_CHECKPOINT:
+            raise ValueError(f"claims arrays of {sum(sizes)} bytes, at most {LARGEST_CHECKPOINT} are read")
+        kinds = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), stated)
         tree = handler.restore(epath.Path(item), args=ocp.args.PyTreeRestore(restore_args=kinds))
         handler.close()
         if item != folder and (folder / "metadata").is_dir():
             metadata |= ocp.JsonCheckpointHandler().restore(
                 epath.Path(folder / "metadata"), args=ocp.args.JsonRestore()
             )
-        return Weights(**_stated(metadata), tree=nested(named(tree)), source=str(directory))
-    except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+        check_values(metadata)
+        return Weights(**_stated(metadata), tree=nested(named(tree)), source=source)
+    except Exception as error:  # what Orbax raises on a damaged checkpoint is not documented
         reason = " ".join(str(error).split())[:200]
-        raise ValueError(f"{directory}: damaged Orbax checkpoint ({reason})") from error
+        raise ValueError(printable(f"{source}: damaged Orbax checkpoint ({reason})")) from error
+
+
+def _check_files(folder: Path, source: str) -> None:
+    """Raise `ValueError` where a checkpoint holds a pipe, a device or a link to a folder, or too many bytes."""
+    total = 0
+    for parent, folders, names in os.walk(folder):
+        for name in (*names, *folders):
+            path = os.path.join(parent, name)
+            mode = os.stat(path).st_mode
+            if not stat.S_ISREG(mode) and (not stat.S_ISDIR(mode) or os.path.islink(path)):
+                raise ValueError(printable(f"{source}: damaged Orbax checkpoint ({name} is no regular file)"))
+            total += os.path.getsize(path) if stat.S_ISREG(mode) else 0
+    if total > LARGEST_CHECKPOINT:
+        raise ValueError(f"{source}: an Orbax checkpoint of {total} bytes, at most {LARGEST_CHECKPOINT} are read")
+
+
+def _bytes(leaf: Any) -> int:
+    """How many bytes an array takes by what its metadata state."""
+    shape, dtype = getattr(leaf, "shape", None) or (), getattr(leaf, "dtype", None)
+    return math.prod(int(n) for n in shape) * (8 if dtype is None else np.dtype(dtype).itemsize)
 
 
 def read_weights(path: str | PathLike[str]) -> Weights:

@@ -1,7 +1,6 @@
 """PyTorch checkpoints (`.pth`, `.pth.tar`, the zip format), without PyTorch and without running anything in them."""
 
 import math
-import struct
 import zipfile
 from os import PathLike
 from typing import Any, BinaryIO
@@ -9,6 +8,8 @@ from typing import Any, BinaryIO
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrapolate.files.regular import open_regular
+from jaxtrapolate.files.sequence import printable
 from jaxtrapolate.weights.pickled import Global, read_pickle
 
 _DTYPES = {
@@ -23,7 +24,6 @@ _DTYPES = {
     "torch.ByteStorage": np.dtype(np.uint8),
     "torch.BoolStorage": np.dtype(np.bool_),
 }
-_DAMAGE = (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, LookupError, OverflowError, struct.error)
 
 
 def read_torch(path: str | PathLike[str]) -> dict[str, Any]:
@@ -45,17 +45,18 @@ def read_torch(path: str | PathLike[str]) -> dict[str, Any]:
         ValueError: one line that names the file: no checkpoint, damaged, in the format before 1.6, a global that is
             refused (which is named), or an array that does not fit its storage.
     """
-    with open(path, "rb") as file:
+    source = printable(path)
+    with open_regular(path) as file:
         try:
             value = _Archive(file).read()
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-        except (OSError, *_DAMAGE) as error:
+            raise ValueError(printable(f"{source}: {error}")) from error
+        except Exception as error:  # what the parts of the standard library raise on damaged bytes is not documented
             old = "no zip file; what PyTorch before 1.6 saved has to be saved again by a newer one"
             reason = f"damaged: {' '.join(str(error).split())}" if zipfile.is_zipfile(file) else old
-            raise ValueError(f"{path}: not a PyTorch checkpoint: {reason}") from error
+            raise ValueError(printable(f"{source}: not a PyTorch checkpoint: {reason}")) from error
     if not isinstance(value, dict):
-        raise ValueError(f"{path}: expected a dictionary, got {type(value).__name__}")
+        raise ValueError(f"{source}: expected a dictionary, got {type(value).__name__}")
     return value
 
 
