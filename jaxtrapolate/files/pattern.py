@@ -5,6 +5,8 @@ A full example, for a multi-layer render with PNG masks beside it:
     name = "courtyard"                # for reports; by default the folder's name
     hdr = true                        # colour is HDR; by default where the colour is an EXR
     depth = "metric"                  # in the unit of position, or "ordinal": only larger = farther
+    step = 1                          # from one frame's number to the next one's; by default it is found
+    static_ids = [7, "9e3779b1"]      # ids of the stencil that do not move: walls that have an id, as they are stored
 
     [motion]                          # how motion vectors are stated; what is left out: the library's convention
     sign = "current_minus_previous"   # or "previous_minus_current"
@@ -26,17 +28,34 @@ table with `file` and some of
 
 - `layer`: of an EXR, or the end of its name; the part's name in a multi-part file. By default the unnamed layer.
 - `channels`: their names in the layer, a list or a string of one-letter names. By default the first ones needed, in
-  the order RGBA, XYZ, UVW, Y, Z.
+  the order RGBA, XYZ, UVW, Y, Z; of colours (`color`, `albedo`, `sky_color`) that have only one channel that one, as
+  grey, which a note says.
 - `scale`, `offset`: the value is stored * scale + offset, e.g. 2 and -1 for normals in a PNG.
 - `invert`: 1 - value, after scale and offset: masks of the other polarity, ordinal depth that is larger when nearer.
-- `above`: 1 where the stored value is above this number, else 0; scale, offset and invert do not apply.
+- `above`, `below`: for masks: 1 where the stored value is above (below) this number, else 0; scale, offset and invert
+  do not apply.
+- `nothing_above`, `nothing_below`: for depth: where the stored value is above (below) this number nothing was hit, and
+  depth is +inf, as it is in any case where it is not positive or under the sky mask (`jaxtrapolate.files.repair`).
 - `srgb`: decode 8-bit codes to linear; by default for `color` alone.
 
 A pattern is a path relative to the folder with one `{frame}` in the file's name, with leading zeros as in
-`{frame:04d}`. Codes of PNG files become 0..1, save for a stencil's, which are ids. Flows are in the library's own
-convention, their third channel in the unit of position. Depth +inf is the sky (`jaxtrapolate.files.repair`).
+`{frame:04d}`; its folders are separated by forward slashes (in single quotes a backslash does as well). Frames may have
+negative numbers where the sign cannot be taken for a hyphen, that is unless a letter or digit stands before `{frame}`.
+A file that is left out, since another one is of the same frame (`1` and `0001`) or its number has too few digits, is
+named in a note. With a step (0, 2, 4, ...), motion leads to the frame one step before; vectors that lead to the frame
+with the number before need `scale = 2` there.
 
-For the other readers the same file may hold `[motion]` alone: there, what it leaves out keeps the reader's own default.
+Codes of PNG files become 0..1, save for a stencil's, which are ids: of a picture in colour without `channels` the
+three codes together, each colour an id. Ids in EXR files may be hashes, as integers or as floats (Cryptomatte's first
+channel): they are numbered so that all stay apart (`jaxtrapolate.files.ids`); an antialiased mask is rounded. Most
+renderers give walls an id too: without `static_ids` they count as moving objects. `jaxtrapolate check` finds them.
+
+Flows are in the library's own convention, their third channel in the unit of position. Depth +inf is the sky. Ordinal
+depth may have 0 for its nearest value, and less: it is moved to positive numbers in the same order, v + 1/256, and
+below 0 to 1 / (256 - 65536 v).
+
+For the other readers the same file may hold `[motion]`, `name`, `step` and `static_ids`; what `[motion]` leaves out
+keeps the reader's own default there.
 """
 
 import dataclasses
@@ -50,15 +69,18 @@ from typing import Any, Literal, cast, get_args
 import numpy as np
 
 from jaxtrapolate.files.atomic import os_input_error
-from jaxtrapolate.files.exr import pick, read_exr
+from jaxtrapolate.files.exr import layer_channels, read_exr
+from jaxtrapolate.files.ids import StaticId, color_ids, hexadecimal
 from jaxtrapolate.files.image import decode_srgb, read_png
-from jaxtrapolate.files.reader import BUFFERS, FileSequence, Opened, list_folder
+from jaxtrapolate.files.listing import Files, collect, folder_name, list_folder, some
+from jaxtrapolate.files.reader import BUFFERS, GREY, FileSequence, Opened, is_exr, pick_channels
 from jaxtrapolate.files.sequence import InputError, MotionConvention
 from jaxtrapolate.motion import Sign, Units, YAxis
 
 SETTINGS_NAME = "jaxtrapolate.toml"
 """The name of the TOML file in a folder of frames."""
 
+_BACKSLASH = "forward slashes, or single quotes around it, since in double quotes a backslash starts an escape"
 _FIELD = re.compile(r"\{frame(?::0?(\d*)d)?\}")
 
 
@@ -73,6 +95,9 @@ class Buffer:
     offset: float = 0.0
     invert: bool = False
     above: float | None = None
+    below: float | None = None
+    nothing_above: float | None = None
+    nothing_below: float | None = None
     srgb: bool = False
 
 
@@ -86,6 +111,8 @@ class Settings:
     name: str | None = None
     hdr: bool | None = None
     depth: Literal["metric", "ordinal"] = "metric"
+    step: int | None = None
+    static_ids: tuple[StaticId, ...] = ()
 
     def convention(self, base: MotionConvention) -> MotionConvention:
         """`base` with what `[motion]` states."""
@@ -100,12 +127,24 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
     """
     path = Path(path)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))  # Editors put a byte order mark before it.
     except OSError as error:
         raise os_input_error(path, error) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML, {' '.join(str(error).split())}; correct it") from error
-    kinds = {"name": _text, "hdr": _flag, "depth": _choice("metric", "ordinal"), "motion": _table, "buffers": _table}
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not valid TOML, it is no UTF-8 text; save it as UTF-8") from error
+    except tomllib.TOMLDecodeError as error:
+        text = " ".join(str(error).split())
+        remedy = f"write paths with {_BACKSLASH}" if "scape" in text or "hex" in text else "correct it"
+        raise InputError(f"{path}: not valid TOML, {text}; {remedy}") from error
+    kinds = {
+        "name": _text,
+        "hdr": _flag,
+        "depth": _choice("metric", "ordinal"),
+        "step": _step,
+        "static_ids": _static,
+        "motion": _table,
+        "buffers": _table,
+    }
     content = _checked(path, "", content, kinds)
     motion = _checked(
         path,
@@ -114,6 +153,8 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
         {"sign": _choice(*get_args(Sign)), "units": _choice(*get_args(Units)), "y_axis": _choice(*get_args(YAxis))},
     )
     buffers = _checked(path, "buffers.", content.pop("buffers", {}), dict.fromkeys(BUFFERS, _text_or_table))
+    if not buffers and (unused := [key for key in ("hdr", "depth") if key in content]):
+        raise InputError(f"{path}: {unused[0]} is for files that [buffers] describes; remove it, or add that table")
     return Settings(path, {name: _buffer(path, name, value) for name, value in buffers.items()}, motion, **content)
 
 
@@ -164,7 +205,34 @@ def _channels(value: Any) -> tuple[str, ...]:
     return tuple(value)
 
 
+def _path_text(value: Any) -> str:
+    value = _text(value)
+    if any(ord(character) < 32 for character in value):
+        raise ValueError(_BACKSLASH)
+    return value.replace("\\", "/")
+
+
+def _static(value: Any) -> tuple[StaticId, ...]:
+    numbers = [v for v in value if isinstance(v, int) and not isinstance(v, bool)] if isinstance(value, list) else []
+    texts = [v for v in value if isinstance(v, str)] if isinstance(value, list) else []
+    if not isinstance(value, list) or len(numbers) + len(texts) != len(value):
+        raise ValueError('a list of ids, as numbers or as the hexadecimal digits of hashes, such as [7, "9e3779b1"]')
+    for text in texts:
+        try:
+            hexadecimal(text)
+        except ValueError:
+            raise ValueError(f"eight hexadecimal digits in each text, not {text!r}") from None
+    return tuple(value)
+
+
+def _step(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise ValueError("a whole number, 1 or more")
+    return value
+
+
 def _pattern(value: Any) -> str:
+    value = _path_text(value) if isinstance(value, str) else value
     if not isinstance(value, str) or len(_FIELD.findall(value)) != 1 or not _FIELD.search(os.path.basename(value)):
         raise ValueError("a path with one {frame} or {frame:04d} in the file's name")
     return value
@@ -173,12 +241,15 @@ def _pattern(value: Any) -> str:
 def _buffer(path: Path, name: str, value: str | dict[str, Any]) -> Buffer:
     kinds = {
         "file": _pattern,
-        "layer": _text,
+        "layer": _path_text,
         "channels": _channels,
         "scale": _number,
         "offset": _number,
         "invert": _flag,
         "above": _number,
+        "below": _number,
+        "nothing_above": _number,
+        "nothing_below": _number,
         "srgb": _flag,
     }
     table = _checked(path, f"buffers.{name}.", {"file": value} if isinstance(value, str) else value, kinds)
@@ -186,6 +257,13 @@ def _buffer(path: Path, name: str, value: str | dict[str, Any]) -> Buffer:
         raise InputError(f'{path}: buffers.{name}: no file; add one such as file = "{name}.{{frame:04d}}.exr"')
     if len(table.get("channels", ())) not in (0, BUFFERS[name]):
         raise InputError(f"{path}: buffers.{name}.channels: expected {BUFFERS[name]}, got {len(table['channels'])}")
+    for key in ("above", "below"):
+        if name == "depth" and key in table:
+            text = f"makes a mask; where depth {key} a number is nothing, write nothing_{key}"
+            raise InputError(f"{path}: buffers.depth.{key}: {text} = {table[key]}")
+        if name != "depth" and f"nothing_{key}" in table:
+            text = f"is for depth; for a mask of what is {key} a number, write {key}"
+            raise InputError(f"{path}: buffers.{name}.nothing_{key}: {text} = {table[f'nothing_{key}']}")
     return Buffer(**{"srgb": name == "color", **table})
 
 
@@ -217,71 +295,130 @@ class PatternSequence(FileSequence):
         if not settings.buffers:
             raise InputError(f"{settings.path}: names no buffers; add a table [buffers]")
         self._buffers = settings.buffers
+        self._path = settings.path
         color = settings.buffers.get("color")
+        files, left_out = _find(Path(folder), settings)
         super().__init__(
             folder,
-            _find(Path(folder), settings),
-            name=settings.name or Path(folder).resolve().name,
-            hdr=settings.hdr if settings.hdr is not None else color is None or _is_exr(color.file),
+            files,
+            name=settings.name or folder_name(folder),
+            hdr=settings.hdr if settings.hdr is not None else color is None or is_exr(color.file),
             depth=settings.depth,
             convention=motion or settings.convention(MotionConvention()),
+            step=settings.step,
+            static_ids=settings.static_ids,
+            left_out=left_out,
             strict=strict,
         )
 
     def _read(self, path: Path, buffer: str, opened: Opened) -> np.ndarray:
-        spec, count = self._buffers[buffer], BUFFERS[buffer]
-        name = str(path)
-        if _is_exr(name):
-            if name not in opened:
-                opened[name] = read_exr(path)
-            image = pick(opened[name], path=path, count=count, layer=spec.layer, channels=spec.channels)
+        spec, name = self._buffers[buffer], str(path)
+        if name not in opened:
+            opened[name] = read_exr(path) if is_exr(name) else read_png(path)
+        if is_exr(name):
+            image = pick_channels(opened[name], path=path, buffer=buffer, **self._layer(buffer))
+            grey = (
+                spec.channels is None
+                and BUFFERS[buffer] > 1
+                and len(layer_channels(tuple(opened[name]), spec.layer)) == 1
+            )
         else:
-            if name not in opened:
-                opened[name] = read_png(path)
-            image = _values(path, opened[name], buffer, spec)
-        if spec.above is not None:
-            return (image > spec.above).astype(np.float32)
+            image = _values(path, opened[name], buffer, spec, self._path)
+            grey = spec.channels is None and BUFFERS[buffer] > 1 and opened[name].shape[-1] < 3
+        if grey and buffer in GREY:
+            self._note(f"{buffer} has one channel and is taken for grey")
+        if spec.above is not None or spec.below is not None:
+            return (_beyond(image, spec.above, spec.below)).astype(np.float32)
+        nothing = _beyond(image, spec.nothing_above, spec.nothing_below)
         if (spec.scale, spec.offset) != (1.0, 0.0):
             with np.errstate(over="ignore"):
                 image = image * np.float32(spec.scale) + np.float32(spec.offset)
-        return np.float32(1) - image if spec.invert else image
+        image = np.float32(1) - image if spec.invert else image
+        if buffer == "depth":
+            image = _positive(image) if self.depth == "ordinal" else image
+            image = np.where(nothing, np.float32(np.inf), image) if nothing.any() else image
+        return image
+
+    def _layer(self, buffer: str) -> dict[str, Any]:
+        spec = self._buffers[buffer]
+        return {"layer": spec.layer, "channels": spec.channels}
+
+    def _hashed_ids(self) -> bool:
+        spec = self._buffers["stencil"]
+        return is_exr(spec.file) and "crypto" in f"{spec.layer}.{'.'.join(spec.channels or ())}".lower()
+
+    def _sky_follows(self) -> bool:
+        spec = self._buffers.get("depth")
+        limits = spec is not None and (spec.nothing_above, spec.nothing_below) != (None, None)
+        return self.depth == "metric" or (spec is not None and (limits or is_exr(spec.file)))
 
 
-def _is_exr(name: str) -> bool:
-    return name.lower().endswith(".exr")
+def _beyond(image: np.ndarray, above: float | None, below: float | None) -> np.ndarray:
+    """Where the stored values are above or below the limits that are there."""
+    out = np.zeros(image.shape, bool)
+    if above is not None:
+        out |= image > above
+    if below is not None:
+        out |= image < below
+    return out
 
 
-def _values(path: Path, codes: np.ndarray, buffer: str, spec: Buffer) -> np.ndarray:
-    """The float32 values of a PNG's codes, `[H, W, count]`."""
+def _positive(ordinal: np.ndarray) -> np.ndarray:
+    """Positive numbers in the same order, the same for all frames: v + 1/256, below 0 1 / (256 - 65536 v)."""
+    below = (ordinal < 0) & (ordinal > -np.inf)
+    return np.where(below, 1 / (256 - 65536 * np.where(below, ordinal, 0)), ordinal + 1 / 256).astype(np.float32)
+
+
+def _values(path: Path, codes: np.ndarray, buffer: str, spec: Buffer, settings: Path) -> np.ndarray:
+    """The float32 values of a PNG's codes, `[H, W, count]`; the ids of a stencil."""
     count = BUFFERS[buffer]
-    available = "Y" if codes.shape[-1] <= 2 else "RGBA"
+    available = "Y" if codes.shape[-1] <= 2 else "RGBA"[: codes.shape[-1]]
+    if buffer == "stencil" and spec.channels is None and len(available) >= 3:
+        if codes.dtype != np.uint8:
+            raise InputError(
+                f"{path}: ids as colours of {codes.dtype} do not fit into 24 bits; store them as 8-bit RGB"
+            )
+        return color_ids(codes)
     names = spec.channels or tuple(available[:count])
-    places = [available[: codes.shape[-1]].find(name) if len(name) == 1 else -1 for name in names]
+    if buffer in GREY and available == "Y" and spec.channels is None:
+        names = ("Y", "Y", "Y")
+    places = [available.find(name) if len(name) == 1 else -1 for name in names]
     if len(places) < count or min(places) < 0:
-        have = ", ".join(available[: codes.shape[-1]])
-        raise InputError(f"{path}: {buffer} needs {count} channels ({', '.join(names)}), has {have}; correct the TOML")
+        wanted = f"needs {count} channels" + (f" ({', '.join(names)})" if spec.channels else "")
+        remedy = f"name {count} of them, such as channels = {available[0] * count!r}".replace("'", '"')
+        raise InputError(f"{path}: {buffer} {wanted}, has {', '.join(available)}; in {settings}, {remedy}")
     codes = codes[..., places]
     if buffer == "stencil":
-        return codes.astype(np.float32)
+        return codes
     if spec.srgb and codes.dtype == np.uint8:
         return decode_srgb(codes)
     return codes.astype(np.float32) / np.float32(np.iinfo(codes.dtype).max)
 
 
-def _find(folder: Path, settings: Settings) -> dict[int, dict[str, str]]:
-    """For each frame the file of each buffer, from the patterns."""
-    files: dict[int, dict[str, str]] = {}
+def _find(folder: Path, settings: Settings) -> tuple[Files, list[str]]:
+    """For each frame the file of each buffer, from the patterns; and a line for what is left out."""
+    found: list[tuple[int, str, str, bool]] = []
+    short: dict[str, None] = {}
     listed: dict[str, list[str]] = {}
     for buffer, spec in settings.buffers.items():
         parent, base = os.path.split(spec.file)
         if parent not in listed:
             listed[parent] = list_folder(folder / parent)
         before, digits, after = _FIELD.split(base)
-        number = rf"\d{{{int(digits)},}}" if digits else r"\d+"
-        pattern = re.compile(rf"{re.escape(before)}({number}){re.escape(after)}")
-        found = [(int(match[1]), name) for name in listed[parent] if (match := pattern.fullmatch(name))]
-        if not found:
+        width = int(digits) if digits else 1
+        sign = "" if before[-1:].isalnum() else rf"|-\d{{{max(width - 1, 1)},}}"
+        number = re.compile(rf"\d{{{width},}}{sign}")
+        pattern = re.compile(rf"{re.escape(before)}(-?\d+){re.escape(after)}")
+        matches = [
+            (match[1], os.path.join(parent, name)) for name in listed[parent] if (match := pattern.fullmatch(name))
+        ]
+        fit = [(text, path) for text, path in matches if number.fullmatch(text)]
+        if not fit:
             raise InputError(f"{folder}: no file for {buffer}, {spec.file}; correct the pattern in {settings.path}")
-        for frame, name in found:
-            files.setdefault(frame, {})[buffer] = os.path.join(parent, name)
-    return files
+        found += [(int(text), buffer, path, text == f"{int(text):0{width}d}") for text, path in fit]
+        short |= {path: None for text, path in matches if not number.fullmatch(text)}
+    files, left_out = collect(found)
+    taken = {name for _, _, name, _ in found}
+    if others := [name for name in short if name not in taken]:
+        left_out.append(f"{some(others)} left out: not numbered as the pattern in {settings.path.name} says")
+    return files, left_out

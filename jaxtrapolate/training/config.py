@@ -230,7 +230,7 @@ def load_config(name: str | os.PathLike[str], changes: Mapping[str, Any] | None 
     text = os.fspath(name)
     shipped = _shipped()
     try:
-        content = shipped[text].read_text() if text in shipped else Path(text).read_text(encoding="utf-8")
+        content = shipped[text].read_text() if text in shipped else Path(text).read_text(encoding="utf-8-sig")
         table = tomllib.loads(content)
         for key, value in (changes or {}).items():
             _put(table, key, value)
@@ -282,7 +282,7 @@ def keep_config(config: Config, path: Path, *, write: bool = True) -> None:
     """
     new = dataclasses.asdict(config)
     try:
-        old = json.loads(path.read_text()) if path.exists() else None
+        old = json.loads(path.read_text(encoding="utf-8-sig")) if path.exists() else None
     except OSError as error:
         raise os_input_error(path, error) from error
     except ValueError as error:
