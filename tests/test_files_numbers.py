@@ -63,7 +63,7 @@ def test_a_hyphen_is_no_sign(tmp_path):
     text = "beauty-0001.exr, beauty-0002.exr left out: not numbered as the pattern in jaxtrapolate.toml says"
     assert sequence.notes == (text,)
     with pytest.raises(
-        InputError, match="left out: not numbered as .*; remove or rename its files, or read it without"
+        InputError, match=r"left out: not numbered as .*; remove or rename its files, or read it without"
     ):
         open_sequence(tmp_path, strict=True)
 

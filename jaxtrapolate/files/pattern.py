@@ -353,7 +353,7 @@ class PatternSequence(FileSequence):
         return self.depth == "metric" or (spec is not None and (limits or is_exr(spec.file)))
 
 
-def _beyond(image: np.ndarray, above: float | None, below: float | None) -> np.ndarray:
+def _beyond(image: np.ndarray, above: float | int | None, below: float | int | None) -> np.ndarray:
     """Where the stored values are above or below the limits that are there."""
     out = np.zeros(image.shape, bool)
     if above is not None:
