@@ -95,22 +95,35 @@ fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
 quiet = pytest.mark.filterwarnings("ignore:.*fork:RuntimeWarning", "ignore:.*fork:DeprecationWarning")
 
 
+def use_jax():
+    import jax
+
+    import jaxtrapolate as jx
+
+    jax.block_until_ready(jx.backward_warp(jax.numpy.ones((200, 300, 3)), jax.numpy.zeros((200, 300, 2))))
+
+
 @fork
 @quiet
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("opened", ["before", "after", "read before"])
 def test_a_forked_worker_reads(inputs, name, opened):
-    import jax
-
-    import jaxtrapolate as jx
-
-    still = np.zeros((40, 60, 2), np.float32)
-    jax.block_until_ready(jx.backward_warp(jax.numpy.ones((40, 60, 3)), jax.numpy.asarray(still)))
+    use_jax()
     sequence = None if opened == "after" else open_sequence(inputs / name)
     if opened == "read before" and sequence is not None:
         sequence.frame(2)
     read = forked(lambda: everything(sequence or open_sequence(inputs / name)))
     assert read == everything(open_sequence(inputs / name))
+
+
+@fork
+@quiet
+def test_a_forked_worker_reads_what_jax_would_use_threads_for(tmp_path):
+    """A frame so large that a computation on it is given to JAX's threads, which a forked process does not have."""
+    motion = np.random.default_rng(0).normal(size=(180, 320, 3)).astype(np.float32)
+    write_exr(tmp_path / "TownMotionVector.0001.exr", motion, half=False)
+    use_jax()
+    np.testing.assert_array_equal(forked(lambda: open_sequence(tmp_path).frame(1).motion), motion[..., :2] * [-1, 1])
 
 
 @fork
