@@ -202,3 +202,22 @@ def test_layer_that_is_not_there(tmp_path):
     (tmp_path / "jaxtrapolate.toml").write_text('[buffers]\ndepth = { file = "multi.{frame}.exr", layer = "Mist" }\n')
     with pytest.raises(InputError, match=r"multi\.0001\.exr: needs 1 channel in layer 'Mist', has .*ViewLayer"):
         open_sequence(tmp_path).frame(1)
+
+
+def test_a_byte_order_mark(tmp_path):
+    write_exr(tmp_path / "1.exr", np.ones((*SIZE, 3)))
+    path = tmp_path / "jaxtrapolate.toml"
+    path.write_bytes(b'\xef\xbb\xbf[buffers]\ncolor = "{frame}.exr"\n')
+    assert open_sequence(tmp_path).numbers == (1,)
+    path.write_bytes('[buffers]\ncolor = "{frame}.exr"\n'.encode("utf-16"))
+    with pytest.raises(InputError, match="it is no UTF-8 text; save it as UTF-8"):
+        open_sequence(tmp_path)
+
+
+@pytest.mark.parametrize("path", [r"'sub\b.{frame}.exr'", r"'.\sub\b.{frame}.exr'", r'"sub\\b.{frame}.exr"'])
+def test_what_is_to_be_written_for_a_backslash(tmp_path, path):
+    """Single quotes, and two of them in double quotes, are read as forward slashes."""
+    (tmp_path / "sub").mkdir()
+    write_exr(tmp_path / "sub" / "b.1.exr", np.ones((*SIZE, 3)))
+    (tmp_path / "jaxtrapolate.toml").write_text(f"[buffers]\ncolor = {path}\n")
+    assert (open_sequence(tmp_path).frame(1).color == 1).all()
