@@ -174,5 +174,5 @@ def test_a_frame_that_changed_meanwhile(tmp_path):
     sequence = open_sequence(tmp_path)
     assert stripes(sequence, 1)[0] == 1
     store(tmp_path / "2.exr", Y=filled(2**31))
-    with pytest.raises(InputError, match="stencil: an id that was not there"):
+    with pytest.raises(InputError, match=f"{tmp_path}: the stencil has an id that was not there"):
         sequence.frame(2)

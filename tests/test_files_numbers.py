@@ -98,8 +98,21 @@ def test_packed_files_of_other_kinds_are_named(tmp_path):
     packed(tmp_path, ["0001", "frame2"])
     (tmp_path / "color" / "0003.jpg").write_bytes(b"")
     (tmp_path / "color" / "notes.txt").write_bytes(b"")
+    (tmp_path / "albedo").mkdir()
     sequence = open_sequence(tmp_path)
-    assert sequence.notes == ("color/0003.jpg, color/frame2.png left out: a packed clip's files are named NNNN.png",)
+    assert sequence.notes == (
+        "color/0003.jpg, color/frame2.png left out: a packed clip's files are named NNNN.png",
+        "albedo not read: a packed clip's folders are color, motion, depth, stencil, shadow",
+    )
+
+
+def test_unreal_buffers_of_other_names_are_named(tmp_path):
+    """They are no part of a frame, so that strict reading goes on."""
+    unreal(tmp_path, ["0001"])
+    exr(tmp_path / "TownBaseColour.0001.exr")
+    exr(tmp_path / "beauty.exr")
+    sequence = open_sequence(tmp_path, strict=True)
+    assert sequence.notes == ("TownBaseColour.0001.exr not read: the names are of no buffer of an Unreal dump",)
 
 
 def test_a_first_frame_without_motion_is_refused_when_strict(tmp_path):

@@ -24,8 +24,6 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from jaxtrapolate.files.sequence import InputError
-
 LARGEST = 2**24
 """Integers from 0 to this one are exact in float32."""
 _SMALLEST_INDEX = 2.0**-20
@@ -41,6 +39,17 @@ def plain(values: np.ndarray) -> np.ndarray:
     return ~np.isfinite(values) | ((values >= 0) & (values <= LARGEST) & (values == np.rint(values)))
 
 
+def distinct(values: np.ndarray) -> np.ndarray:
+    """The different values of an image, float64, ascending; neighbours are mostly alike, so they are few to sort."""
+    return np.unique(_starts(values.ravel())[0]).astype(np.float64)
+
+
+def _starts(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The values of the stretches of equal values, and how long each is."""
+    places = np.flatnonzero(np.concatenate([np.ones(min(len(flat), 1), bool), flat[1:] != flat[:-1]]))
+    return flat[places], np.diff(places, append=len(flat))
+
+
 def hexadecimal(text: str) -> int:
     """The 32 bits that "9e3779b1" or "0x9E3779B1" states; ValueError where it is no such text."""
     value = int(text, 16)
@@ -51,14 +60,18 @@ def hexadecimal(text: str) -> int:
 
 def clear_static(values: np.ndarray, static: Iterable[StaticId]) -> np.ndarray:
     """The stored values, 0 where they are an id that is named as static."""
-    for name in static:
-        if isinstance(name, str) and values.dtype.kind == "f":
-            named = values == np.array(hexadecimal(name), np.uint32).view(np.float32)
-        else:
-            named = values == (hexadecimal(name) if isinstance(name, str) else name)
-        if named.any():
-            values = np.where(named, np.zeros((), values.dtype), values)
-    return values
+    bits = values.dtype.kind == "f"
+    named = [_value(hexadecimal(name), bits) if isinstance(name, str) else float(name) for name in static]
+    starts, lengths = _starts(values.ravel())
+    cleared = np.isin(starts.astype(np.float64), named)
+    if not cleared.any():
+        return values
+    return np.where(cleared, 0, starts).astype(values.dtype).repeat(lengths).reshape(values.shape)
+
+
+def _value(word: int, bits: bool) -> float:
+    """What 32 bits stand for: a float32, or an integer."""
+    return float(np.array(word, np.uint32).view(np.float32)) if bits else float(word)
 
 
 def color_ids(codes: np.ndarray) -> np.ndarray:
@@ -95,7 +108,7 @@ class Numbering:
             bits: whether they are stored as floats.
 
         Raises:
-            InputError: more than 2^24 ids.
+            ValueError: more than 2^24 ids.
         """
         found = np.unique(found[np.isfinite(found)])
         kept = plain(found)
@@ -106,25 +119,26 @@ class Numbering:
         if not hashes:
             return cls(np.zeros(0), np.zeros(0, np.float32), False, bits)
         if len(found) > LARGEST:
-            raise InputError(f"stencil: {len(found)} ids, more than 2^24; store an id for each object, not each pixel")
+            raise ValueError(f"the stencil has {len(found)} ids, more than 2^24; store one for each object, not pixel")
         free = np.setdiff1d(np.arange(1, len(found) + 1), taken.astype(np.int64), assume_unique=True)
         return cls(others, free[: len(others)].astype(np.float32), True, bits)
 
     def apply(self, values: np.ndarray) -> np.ndarray:
-        """The ids float32 of stored values; NaN and infinities stay."""
-        kept = plain(values)
-        out = np.where(kept, values, 0).astype(np.float32)
-        if kept.all():
-            return out
-        others = values[~kept].astype(np.float64)
-        if self.hashes:
+        """The ids float32 of stored values; NaN and infinities stay. ValueError where one is not among those stored."""
+        starts, lengths = _starts(values.ravel())
+        kept = plain(starts)
+        out = np.where(kept, starts, 0).astype(np.float32)
+        others = starts[~kept].astype(np.float64)
+        if self.hashes and len(others):
             places = np.searchsorted(self.stored, others).clip(max=max(len(self.stored) - 1, 0))
             if not len(self.stored) or (self.stored[places] != others).any():
-                raise InputError("stencil: an id that was not there when its frames were first read; open it again")
+                raise ValueError(
+                    "the stencil has an id that was not there when its frames were first read; open it again"
+                )
             out[~kept] = self.given[places]
         else:
             out[~kept] = np.maximum(np.rint(others), 0)
-        return out
+        return out.repeat(lengths).reshape(values.shape)
 
     def stated(self, number: int) -> StaticId:
         """How `static_ids` names the id that was given a number: as it is stored."""

@@ -106,6 +106,8 @@ class PackedSequence(FileSequence):
             left_out=left_out,
             strict=strict,
         )
+        if unread := [name for name in list_folder(clip) if name not in FOLDERS and (clip / name).is_dir()]:
+            self.notes += (f"{some(unread)} not read: a packed clip's folders are {', '.join(FOLDERS)}",)
 
     def _read(self, path: Path, buffer: str, opened: Opened) -> np.ndarray:
         codes = read_png(path)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtrapolate.checks import Size
 from jaxtrapolate.files.convention import convert
 from jaxtrapolate.files.exr import exr_outside, exr_size, layer_channels, pick
-from jaxtrapolate.files.ids import Numbering, StaticId, clear_static, plain
+from jaxtrapolate.files.ids import Numbering, StaticId, clear_static, distinct, plain
 from jaxtrapolate.files.image import image_size
 from jaxtrapolate.files.listing import find_step
 from jaxtrapolate.files.repair import fill_nearest, no_depth, nonfinite_pixels, repair
@@ -129,9 +129,12 @@ class FileSequence(Sequence):
         values = clear_static(values, self.static_ids)
         if plain(values).all():
             return values.astype(np.float32)
-        if self._numbering is None:
-            self._numbering = self._number_ids()
-        return self._numbering.apply(values)
+        try:
+            if self._numbering is None:
+                self._numbering = self._number_ids()
+            return self._numbering.apply(values)
+        except ValueError as error:
+            raise InputError(f"{self.folder}: {error}") from error
 
     def _number_ids(self) -> Numbering:
         """Reads the stencils of all frames, once."""
@@ -139,7 +142,7 @@ class FileSequence(Sequence):
         for number in self.numbers:
             values = clear_static(self._checked(self.files(number)["stencil"], "stencil", {}), self.static_ids)
             bits |= values.dtype.kind == "f"
-            found.append(np.unique(values).astype(np.float64))
+            found.append(distinct(values))
         numbering = Numbering.of(np.concatenate(found), crypto=self._hashed_ids(), bits=bits)
         if numbering.hashes:
             first, last = int(numbering.given[0]), int(numbering.given[-1])

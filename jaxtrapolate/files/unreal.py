@@ -18,9 +18,9 @@
 The unit of position, and so of depth and of its changes, is the centimetre. Buffers of one channel may be stored with
 one or as grey with three, colours as one channel of grey. Depth is +inf where the sky is, whatever is stored there, and
 where it is not positive (`jaxtrapolate.files.repair`). Numbers may be negative; where two files are of one frame, as
-`.1.exr` and `.0001.exr`, one is left out, and a note says which. Frame 0000, which the release of ExtraNet drops, is
-kept: it serves as history. Only a first frame that has no MotionVector at all, while others have, is left out
-(`FileSequence.notes`).
+`.1.exr` and `.0001.exr`, one is left out, and a note says which; another note names EXR files of no known buffer. Frame
+0000, which the release of ExtraNet drops, is kept: it serves as history. Only a first frame that has no MotionVector at
+all, while others have, is left out (`FileSequence.notes`).
 """
 
 import os
@@ -36,7 +36,7 @@ from jaxtrapolate.files.atomic import os_input_error
 from jaxtrapolate.files.convention import unconvert
 from jaxtrapolate.files.exr import read_exr, write_exr
 from jaxtrapolate.files.ids import StaticId
-from jaxtrapolate.files.listing import Files, collect, folder_name, list_folder
+from jaxtrapolate.files.listing import Files, collect, folder_name, list_folder, some
 from jaxtrapolate.files.reader import BUFFERS, FLOWS, FileSequence, Opened, pick_channels
 from jaxtrapolate.files.repair import nothing_hit
 from jaxtrapolate.files.sequence import InputError, MotionConvention
@@ -67,6 +67,7 @@ CONVENTION = MotionConvention("current_minus_previous", "pixels", "up")
 
 _FIELDS = {name: field for field, name in NAMES.items()} | {"SkyboxColor": "sky_color"}
 _FILE = re.compile(rf"(?P<scene>.*?)(?P<buffer>{'|'.join(_FIELDS)})\.(?P<number>-?\d+)\.exr", re.IGNORECASE)
+_OTHER = re.compile(r".*\.-?\d+\.exr", re.IGNORECASE)
 _LOWER = {name.lower(): field for name, field in _FIELDS.items()}
 
 _DEPTH_TO_CM = 1e4
@@ -114,7 +115,8 @@ class UnrealSequence(FileSequence):
         static_ids: Iterable[StaticId] = (),
         strict: bool = False,
     ) -> None:
-        scenes = unreal_files(list_folder(folder))
+        names = list_folder(folder)
+        scenes = unreal_files(names)
         if scene is None and len(scenes) > 1:
             found = ", ".join(map(repr, sorted(scenes)))
             raise InputError(f"{folder}: holds several scenes ({found}); put each into a folder of its own")
@@ -135,6 +137,8 @@ class UnrealSequence(FileSequence):
             left_out=left_out,
             strict=strict,
         )
+        if others := [file for file in names if _OTHER.fullmatch(file) and not _FILE.fullmatch(file)]:
+            self.notes += (f"{some(others)} not read: the names are of no buffer of an Unreal dump",)
 
     def _read(self, path: Path, buffer: str, opened: Opened) -> np.ndarray:
         image = pick_channels(read_exr(path), path=path, buffer=buffer)
