@@ -73,6 +73,22 @@ def test_pixels_without_depth_are_counted(tmp_path, check):
     )
 
 
+@pytest.mark.parametrize("farthest, said", [((1e10, 1e10), True), ((1e10, 50), False)])
+def test_a_largest_depth_that_may_stand_for_nothing(tmp_path, check, farthest, said):
+    depth = np.random.default_rng(0).uniform(1, 20, (8, 10)).astype(np.float32)
+    for number, far in enumerate(farthest):
+        depth[:3] = far
+        write_exr(tmp_path / f"{number}.exr", {"Z": depth}, half=False)
+    settings = tmp_path / "jaxtrapolate.toml"
+    settings.write_text('[buffers]\ndepth = "{frame}.exr"\n')
+    text = (
+        "depth: many pixels of 2 of 2 frames read have the same largest 1e+10; if nothing was hit there, nothing_above"
+    )
+    assert (text in check(tmp_path)) == said
+    settings.write_text('[buffers]\ndepth = { file = "{frame}.exr", nothing_above = 1e9 }\n')
+    assert text not in check(tmp_path)
+
+
 def walls(folder, hashes=None, moving=(2, 3)):
     """Blocks that all have an id; the moving ones have a motion of their own."""
     for number in (1, 2):

@@ -25,6 +25,7 @@ from jaxtrapolate.records import CHANNELS, Frame
 _SCANNED = 20  # frames whose buffers are read
 _WATCHED = 8  # frames in which objects are compared to the camera
 _PAIRS = 4  # pairs of frames that conventions are tried on
+_PLATEAU = 0.01  # of a frame's pixels have its largest depth: it may stand for nothing
 _ALIKE = 0.1  # dB: less is no difference
 
 
@@ -60,8 +61,8 @@ class Scan:
 
     numbers: of these frames. buffers: by name, shape, range, and in how many frames. nonfinite: such pixels, by frame.
     no_depth: pixels without depth by frame, by why. ids: for each object, in which frames it moves as the camera does;
-    None where that cannot be told. watched: the frames in which the camera's motion was found. colors: how many of all
-    frames have colour.
+    None where that cannot be told. watched: the frames in which the camera's motion was found. farthest: the largest
+    depth of frames in which many pixels have it. colors: how many of all frames have colour.
     """
 
     numbers: list[int]
@@ -70,6 +71,7 @@ class Scan:
     no_depth: dict[int, dict[str, int]] = dataclasses.field(default_factory=dict)
     ids: dict[int, list[bool]] = dataclasses.field(default_factory=dict)
     watched: list[int] = dataclasses.field(default_factory=list)
+    farthest: dict[float, list[int]] = dataclasses.field(default_factory=dict)
     colors: int = 0
 
 
@@ -97,6 +99,8 @@ def _scan(sequence: Sequence, bar) -> Scan:
             entry["constant"] &= low == high and entry["low"] == low
             entry["low"], entry["high"] = float(np.fmin(entry["low"], low)), float(np.fmax(entry["high"], high))
             entry["frames"] += 1
+            if name == "depth" and np.count_nonzero(value == high) > _PLATEAU * value.size:
+                scan.farthest.setdefault(high, []).append(number)
         if bad := sequence.nonfinite(number):
             scan.nonfinite[number] = bad
         if none := sequence.no_depth(number):
@@ -228,6 +232,12 @@ def _print_summary(sequence: Sequence, scan: Scan, out: Console) -> None:
 
 
 def _print_no_depth(sequence: Sequence, scan: Scan, out: Console) -> None:
+    if sequence.depth == "metric" and len(scan.farthest) == 1:
+        ((depth, numbers),) = scan.farthest.items()
+        text = (
+            f"depth: many pixels of {len(numbers)} of {len(scan.numbers)} frames read have the same largest {depth:g}"
+        )
+        out.print(f"{text}; if nothing was hit there, nothing_above in {SETTINGS_NAME} says so", soft_wrap=True)
     if not scan.no_depth:
         return
     causes: dict[str, int] = {}
