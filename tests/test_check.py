@@ -14,7 +14,7 @@ from jaxtrapolate.files import open_sequence, write_exr, write_png, write_unreal
 
 
 @pytest.fixture
-def check(capsys, monkeypatch):
+def check_motion(capsys, monkeypatch):
     """What the command prints of a folder, without the table of methods, which would have to read their weights."""
     monkeypatch.setattr("jaxtrapolate.commands.check._print_methods", lambda *_: None)
 
@@ -25,7 +25,14 @@ def check(capsys, monkeypatch):
     return run
 
 
-def write(folder, numbers, change=lambda frame, number: frame, size=(16, 24)):
+@pytest.fixture
+def check(check_motion, monkeypatch):
+    """And without trying conventions."""
+    monkeypatch.setattr("jaxtrapolate.commands.check.try_conventions", lambda *_: None)
+    return check_motion
+
+
+def write(folder, numbers, change=lambda frame, number: frame, size=(32, 48)):
     for time, number in enumerate(numbers):
         write_unreal_frame(folder, "Town", number, change(make_frame(time, size), number))
 
@@ -43,7 +50,7 @@ def test_the_frames_that_were_read_are_named(tmp_path, check):
 
 def test_a_step_and_what_is_left_out(tmp_path, check):
     write(tmp_path, [0, 2, 4, 10], lambda frame, number: jx.replace(frame, color=None) if number == 2 else frame)
-    write_exr(tmp_path / "TownBaseColor.4.exr", np.zeros((16, 24, 3)))
+    write_exr(tmp_path / "TownBaseColor.4.exr", np.zeros((32, 48, 3)))
     out = check(tmp_path)
     assert "4 frames (0-10, step 2)" in out
     assert "gap: frames 6-8 are missing" in out
@@ -61,9 +68,9 @@ def test_pixels_without_depth_are_counted(tmp_path, check):
 
     write(tmp_path, [0, 1, 2], change)
     out = check(tmp_path)
-    counts = {"infinite": 3 + 3, "not positive": 2 * 24 - 3 + 16 * 24 - 3}
+    counts = {"infinite": 3 + 3, "not positive": 2 * 48 - 3 + 32 * 48 - 3}
     total = sum(counts.values())
-    assert f"no depth: {total} pixels ({total / (3 * 16 * 24):.1%}) in 3 of 3 frames read, taken for infinitely" in out
+    assert f"no depth: {total} pixels ({total / (3 * 32 * 48):.1%}) in 3 of 3 frames read, taken for infinitely" in out
     assert f"{counts['infinite']} infinite, {counts['not positive']} not positive" in out
     assert "scale = -1" not in out  # frame 2: -inf is no depth but an invalid pixel
     write(tmp_path, [0, 1, 2], lambda f, _: jx.replace(f, gbuffer=jx.replace(f.gbuffer, depth=-f.gbuffer.depth)))
@@ -136,17 +143,17 @@ def trial(folder):
         return sequence, try_conventions(sequence, bar)
 
 
-def test_frames_that_do_not_change_say_nothing(tmp_path, check):
+def test_frames_that_do_not_change_say_nothing(tmp_path, check_motion):
     """Every convention is exact, and infinitely good."""
-    still = make_frame(0, (16, 24))
+    still = make_frame(0, (32, 48))
     write(tmp_path, [0, 1, 2], lambda *_: jx.replace(still, motion=np.zeros_like(still.motion)))
     assert all(decibels == np.inf for _, decibels in trial(tmp_path)[1].conventions)
-    out = check(tmp_path)
+    out = check_motion(tmp_path)
     assert "all conventions are alike" in out
     assert "nan" not in out
 
 
-def test_conventions_that_cannot_be_told_apart(tmp_path, check):
+def test_conventions_that_cannot_be_told_apart(tmp_path, check_motion):
     """Without vertical motion the y axis may point either way: the one in use is not called wrong."""
 
     def change(frame, number):
@@ -155,29 +162,29 @@ def test_conventions_that_cannot_be_told_apart(tmp_path, check):
         motion = np.zeros((32, 48, 2), np.float32) + np.float32([2, 0])
         return jx.replace(frame, color=color[None].repeat(32, 0).astype(np.float32), motion=motion)
 
-    write(tmp_path, range(4), change, (32, 48))
+    write(tmp_path, range(4), change)
     for option in ((), ("--motion", "down")):
-        out = " ".join(check(tmp_path, *option).split())
+        out = " ".join(check_motion(tmp_path, *option).split())
         assert ", as in use;" in out
         other = "down" if not option else "up"
         assert f"current_minus_previous,pixels,{other} cannot be told from it here" in out
 
 
-def test_vectors_that_are_none(tmp_path, check):
+def test_vectors_that_are_none(tmp_path, check_motion):
     """Noise instead of motion: no convention is recommended."""
     noise = np.random.default_rng(0).uniform(-9, 9, (32, 48, 2)).astype(np.float32)
-    write(tmp_path, range(4), lambda frame, _: jx.replace(frame, motion=noise), (32, 48))
-    out = check(tmp_path)
+    write(tmp_path, range(4), lambda frame, _: jx.replace(frame, motion=noise))
+    out = check_motion(tmp_path)
     assert "no convention is better than no motion at all" in " ".join(out.split())
     assert "run with --motion" not in out
 
 
-def test_vectors_of_one_number_where_the_step_is_two(tmp_path, check):
-    write(tmp_path, [0, 2, 4, 6], lambda frame, _: jx.replace(frame, motion=frame.motion / 2), (32, 48))
+def test_vectors_of_one_number_where_the_step_is_two(tmp_path, check_motion):
+    write(tmp_path, [0, 2, 4, 6], lambda frame, _: jx.replace(frame, motion=frame.motion / 2))
     text = "2 times as long they are"
-    assert text in check(tmp_path)
-    write(tmp_path, [0, 2, 4, 6], size=(32, 48))
-    assert text not in check(tmp_path)
+    assert text in check_motion(tmp_path)
+    write(tmp_path, [0, 2, 4, 6])
+    assert text not in check_motion(tmp_path)
 
 
 def test_pixels_that_are_not_finite_have_no_part(tmp_path):
@@ -189,8 +196,8 @@ def test_pixels_that_are_not_finite_have_no_part(tmp_path):
             motion[3, 4], color[5, 6] = np.nan, np.inf
         return jx.replace(frame, motion=motion, color=color)
 
-    write(tmp_path / "a", range(3), size=(32, 48))
-    write(tmp_path / "b", range(3), spoil, (32, 48))
+    write(tmp_path / "a", range(3))
+    write(tmp_path / "b", range(3), spoil)
     whole, spoilt = (dict(trial(tmp_path / name)[1].conventions) for name in "ab")
     assert all(np.isfinite(list(spoilt.values())))
     for convention, decibels in whole.items():
