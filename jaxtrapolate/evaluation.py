@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.causes import CAUSES, cause_map, disoccluded
 from jaxtrapolate.checks import ArrayLike, check_present
-from jaxtrapolate.files import Sequence, prefetch, runs
+from jaxtrapolate.files import Sequence, around, prefetch, runs
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.metrics import Metric, psnr
 from jaxtrapolate.metrics import load as load_metric
@@ -57,26 +57,34 @@ def held_back(sequence: Sequence, *, past: int, future: int = 0) -> list[int]:
 
 
 def windows(sequence: Sequence, numbers: list[int], *, past: int, future: int = 0) -> Iterator[Window]:
-    """The held-back frames `numbers` with the frames around them, on the device; each frame is read once."""
+    """The held-back frames `numbers` with the frames around them, on the device; each frame is read once.
+
+    Neighbours are those in a run, whatever the step of the numbering; every second one from a held-back frame on is
+    held back, too.
+
+    Raises:
+        ValueError: fewer frames around one of them than a window has.
+    """
     before, behind = 2 * past - 1, max(0, 2 * future - 1)
-    needed = sorted({i for n in numbers for i in range(n - before, n + behind + 1)})
+    groups = {n: around(sequence, n, before=before, behind=behind) for n in numbers}
     wanted = iter(numbers)
     number = next(wanted, None)
     cached: dict[int, Frame] = {}
-    for i, frame in prefetch(sequence, needed):
+    for i, frame in prefetch(sequence, sorted({i for group in groups.values() for i in group})):
         cached[i] = jax.device_put(frame)
-        while number is not None and i == number + behind:
-            rendered = {k: f if (k - number) % 2 else hide(f) for k, f in cached.items()}
+        while number is not None and i == groups[number][-1]:
+            group = groups[number]
+            rendered = [cached[n] if (k - before) % 2 else hide(cached[n]) for k, n in enumerate(group)]
             yield Window(
                 number=number,
                 truth=cached[number],
-                history=tuple(rendered[k] for k in range(number - before, number)),
-                target=rendered[number],
-                future=tuple(rendered[k] for k in range(number + 1, number + behind + 1)),
+                history=tuple(rendered[:before]),
+                target=rendered[before],
+                future=tuple(rendered[before + 1 :]),
             )
             number = next(wanted, None)
         if number is not None:
-            cached = {k: f for k, f in cached.items() if k >= number - before}
+            cached = {k: f for k, f in cached.items() if k >= groups[number][0]}
 
 
 def arguments(method: Method, window: Window) -> tuple[tuple[Frame, ...], Frame, tuple[Frame, ...]]:
@@ -98,7 +106,8 @@ def causes_of(sequence: Sequence, window: Window) -> np.ndarray | None:
     motion = window.target.motion
     if motion is None:
         return None
-    target, source = sequence.keyframe(window.number), sequence.keyframe(window.number - 1)
+    previous, number = around(sequence, window.number, before=1)
+    target, source = sequence.keyframe(number), sequence.keyframe(previous)
     hidden, metric = None, sequence.depth == "metric"
     if metric and target is not None and source is not None:
         exact = target.backward_flow is not None and source.depth is not None

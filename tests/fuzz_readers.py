@@ -448,7 +448,7 @@ def read(kind: str, path: Path) -> None:
     """Hands a file to what reads its kind."""
     from jaxtrapolate import weights
     from jaxtrapolate.files import exr, image, open_sequence
-    from jaxtrapolate.files.pattern import read_settings
+    from jaxtrapolate.files.description import read_settings
     from jaxtrapolate.files.text import read_json
     from jaxtrapolate.methods.extranet import load_extranet
     from jaxtrapolate.training.config import load_config

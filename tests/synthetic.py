@@ -81,3 +81,25 @@ class SyntheticSequence(Sequence):
 
     def keyframe(self, number):
         return make_keyframe(number, self.size)
+
+
+def _rotation(axis, angle):
+    """Rodrigues' formula."""
+    x, y, z = np.asarray(axis) / np.linalg.norm(axis)
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+
+
+def static_scene(size=(48, 64), *, turn=0.02, shift=(0.1, -0.05, 0.2), zoom=1.0, seed=0):
+    """Depth and motion of random smooth relief before a camera that moved, by projecting every point; ids in blocks."""
+    height, width = size
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    rng = np.random.default_rng(seed)
+    waves = sum(rng.normal() * np.sin(rng.normal() * x / 9 + rng.normal() * y / 7 + k) for k in range(6))
+    depth = 6 + waves
+    focal, there = 50.0, 50.0 * zoom
+    points = np.stack([(x - 31) * depth / focal, (y - 23) * depth / focal, depth], -1)
+    moved = points @ _rotation([1, 2, -1], turn).T + np.asarray(shift)
+    place = moved[..., :2] / moved[..., 2:] * there + [31, 23]
+    ids = 1 + (y // 16) * 4 + x // 16
+    return depth[..., None], place - np.stack([x, y], -1), ids[..., None].astype(np.float32)

@@ -61,6 +61,7 @@ def test_check_reports_buffers_convention_and_methods(capsys, dump):
     code, out, _ = run(capsys, "check", dump)
     assert code == 0
     assert "9 frames (0-8), 48x32, HDR" in out
+    assert "read: all 9 frames" in out
     assert "current_minus_previous,pixels,up, as in use" in out
     for word in ("albedo", "no non-finite pixels", "guided_warp", "absent: "):
         assert word in out
@@ -329,7 +330,9 @@ def test_check_finds_the_convention_of_real_input(data, name, change):
     }[change]
     sequence.stored_motion = lambda number: stored(number) * factor
     with progress(Console(stderr=True)) as bar:
-        tried = try_conventions(sequence, bar)
+        trial = try_conventions(sequence, bar)
+    assert trial is not None
+    tried = trial.conventions
     assert len(tried) == 12
     assert tried[0][0] == MotionConvention.parse(expected, base=stated)
     assert tried[0][1] > tried[1][1] + 1

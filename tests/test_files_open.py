@@ -63,7 +63,7 @@ def test_two_scenes(tmp_path):
     dump(tmp_path, [1], scene="Town")
     dump(tmp_path, [1], scene="Field")
     fails(tmp_path, "'Field', 'Town'", "folder of its own")
-    assert UnrealSequence(tmp_path, scene="Town").name == "Town"
+    assert UnrealSequence(tmp_path, scene="Town").name == f"{tmp_path.name} (Town)"
     with pytest.raises(InputError, match="of scene 'Lake'"):
         UnrealSequence(tmp_path, scene="Lake")
 

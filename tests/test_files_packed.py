@@ -40,7 +40,8 @@ def test_every_buffer(tmp_path, size):
     frame = sequence.frame(1)
     assert frame.color.dtype == frame.motion.dtype == np.float32
     np.testing.assert_array_equal(encode_srgb(frame.color), codes["color"])
-    np.testing.assert_allclose(frame.gbuffer.depth[..., 0], 1 - codes["depth"] / 255, atol=1e-6)
+    np.testing.assert_array_equal(frame.gbuffer.depth[..., 0], (256 - codes["depth"]) / 256)
+    assert frame.gbuffer.sky is None
     np.testing.assert_array_equal(frame.gbuffer.stencil[..., 0], codes["stencil"] > 0)
     np.testing.assert_allclose(frame.gbuffer.shadow[..., 0], codes["shadow"] / 255, atol=1e-6)
     # The formula of the format: previous = (x - mv_x, y - mv_y), rows downwards.
@@ -66,14 +67,17 @@ def test_motion_codes():
 def test_ids_stay_ids(tmp_path):
     clip(tmp_path)
     Image.fromarray(np.array([[0, 1, 2, 3, 255]] * 3, np.uint8)).save(tmp_path / "stencil" / "0000.png")
-    np.testing.assert_array_equal(PackedSequence(tmp_path).frame(0).gbuffer.stencil[0, :, 0], [0, 1, 2, 3, 1])
+    sequence = PackedSequence(tmp_path)
+    assert [sequence.stored_id(number) for number in (1, 2, 255)] == [255, 2, 1]
+    np.testing.assert_array_equal(PackedSequence(tmp_path).frame(0).gbuffer.stencil[0, :, 0], [0, 255, 2, 3, 1])
 
 
 def test_clip_in_a_subfolder(tmp_path):
     clip(tmp_path / "540p")
     (tmp_path / "1080p" / "color").mkdir(parents=True)
     assert open_sequence(tmp_path).numbers == (0, 1)
-    assert open_sequence(tmp_path / "540p").name == "540p"
+    assert open_sequence(tmp_path / "540p").name == f"{tmp_path.name}/540p"
+    assert open_sequence(tmp_path).name == tmp_path.name
     clip(tmp_path / "720p")
     with pytest.raises(InputError, match="several clips"):
         open_sequence(tmp_path)

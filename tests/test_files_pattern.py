@@ -53,13 +53,15 @@ def test_the_documented_example(tmp_path):
     frame = sequence.frame(2)
     gbuffer = frame.gbuffer
     np.testing.assert_array_equal(frame.color, np.stack(list(planes(2, "R", "G", "B").values()), -1))
-    np.testing.assert_allclose(gbuffer.depth[..., 0], multi["ViewLayer.Depth.Z"] * 0.01, rtol=1e-6)
+    expected = np.where(multi["ViewLayer.Depth.Z"] > 1e9, np.inf, multi["ViewLayer.Depth.Z"] * 0.01)
+    np.testing.assert_allclose(gbuffer.depth[..., 0], expected, rtol=1e-6)
     np.testing.assert_array_equal(gbuffer.sky[..., 0], multi["ViewLayer.Depth.Z"] > 1e9)
     np.testing.assert_array_equal(gbuffer.normal[..., 2], multi["ViewLayer.Normal.Z"])
     np.testing.assert_array_equal(frame.motion[..., 0], -multi["ViewLayer.Vector.X"])
     np.testing.assert_array_equal(frame.motion[..., 1], multi["ViewLayer.Vector.Y"])
     np.testing.assert_array_equal(gbuffer.albedo, decode_srgb(codes))
     np.testing.assert_array_equal(gbuffer.stencil[..., 0], codes[..., 0] % 3)
+    assert sequence.static_ids == (7, "9e3779b1")
     np.testing.assert_allclose(gbuffer.shadow[..., 0], 1 - codes[..., 1] / 255, atol=1e-6)
     assert open_sequence(tmp_path / "jaxtrapolate.toml").numbers == (1, 2)
     assert str(open_sequence(tmp_path, motion="ndc").convention) == "current_minus_previous,ndc,up"
@@ -93,7 +95,8 @@ def test_png_only_with_flows_and_options(tmp_path):
     frame = sequence.frame(7)
     np.testing.assert_array_equal(frame.color, decode_srgb(codes[..., :3]))
     np.testing.assert_allclose(frame.gbuffer.normal, codes[..., :3] / 127.5 - 1, atol=1e-6)
-    np.testing.assert_allclose(frame.gbuffer.depth[..., 0], 1 - codes[..., 3] / 255, atol=1e-6)
+    np.testing.assert_allclose(frame.gbuffer.depth[..., 0], 1 - codes[..., 3] / 255 + 1 / 256, atol=1e-6)
+    assert frame.gbuffer.depth.min() > 0
     np.testing.assert_array_equal(sequence.keyframe(7).forward_flow[0, 0], [1, 2, 3])
 
 
@@ -116,6 +119,23 @@ def test_png_only_with_flows_and_options(tmp_path):
         ('[buffers]\ndepth = { file = "{frame}.exr", channels = [1] }', "buffers.depth.channels: expected a list"),
         ('[buffers]\nmotion = { file = "{frame}.exr", channels = "X" }', "buffers.motion.channels: expected 2, got 1"),
         ('[buffers]\ncolor = "none.{frame}.exr"', "no file for color, none.{frame}.exr"),
+        (
+            '[buffers]\ncolor = ".\\beauty.{frame}.exr"',
+            "buffers.color.file: expected forward slashes, or single quotes",
+        ),
+        ('[buffers]\ncolor = ".\\depth.{frame}.exr"', "write paths with forward slashes, or single quotes around it"),
+        ('[buffers]\ncolor = "C:\\Users\\{frame}.exr"', "write paths with forward slashes, or single quotes around it"),
+        ("step = 0", "step: expected a whole number, 1 or more, got 0"),
+        ("static_ids = 7", "static_ids: expected a list of ids"),
+        ('static_ids = ["wall"]', "static_ids: expected eight hexadecimal digits in each text, not 'wall'"),
+        (
+            '[buffers]\ndepth = { file = "{frame}.exr", above = 9 }',
+            "where depth above a number is nothing, write nothing_",
+        ),
+        (
+            '[buffers]\nsky = { file = "{frame}.exr", nothing_below = 9 }',
+            "for a mask of what is below a number, write below",
+        ),
         ('[buffers]\ncolor = "no/{frame}.exr"', "does not exist"),
     ],
 )
@@ -131,20 +151,50 @@ def test_mistakes(tmp_path, text, message):
 def test_settings_without_buffers_or_missing(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         PatternSequence(tmp_path)
-    (tmp_path / "jaxtrapolate.toml").write_text("hdr = true")
+    (tmp_path / "jaxtrapolate.toml").write_text('name = "a"')
     with pytest.raises(InputError, match="names no buffers"):
         PatternSequence(tmp_path)
-    (tmp_path / "jaxtrapolate.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(InputError, match="not valid TOML"):
+    (tmp_path / "jaxtrapolate.toml").write_text("hdr = true")
+    with pytest.raises(InputError, match=r"hdr is for files that \[buffers\] describes"):
         PatternSequence(tmp_path)
 
 
-@pytest.mark.parametrize("toml", ['"a.{frame}.png"', '{ file = "a.{frame}.png", channels = ["Depth", "G", "B"] }'])
-def test_channels_that_are_not_there(tmp_path, toml):
+@pytest.mark.parametrize(
+    "buffer, toml, message",
+    [
+        ("normal", '"a.{frame}.png"', 'normal needs 3 channels, has Y; in .*toml, name 3 of them, .* channels = "YYY"'),
+        (
+            "color",
+            '{ file = "a.{frame}.png", channels = ["Depth", "G", "B"] }',
+            r"color needs 3 channels \(Depth, G, B\), has Y; in",
+        ),
+    ],
+)
+def test_channels_that_are_not_there(tmp_path, buffer, toml, message):
     png(tmp_path / "a.1.png", np.zeros(SIZE, np.uint8))
-    (tmp_path / "jaxtrapolate.toml").write_text(f"[buffers]\ncolor = {toml}\n")
-    with pytest.raises(InputError, match=r"a\.1\.png: color needs 3 channels"):
+    (tmp_path / "jaxtrapolate.toml").write_text(f"[buffers]\n{buffer} = {toml}\n")
+    with pytest.raises(InputError, match=message) as error:
         open_sequence(tmp_path).frame(1)
+    assert str(tmp_path / "a.1.png") in str(error.value)
+
+
+@pytest.mark.parametrize("channels", ["", ', channels = "YYY"'])
+@pytest.mark.parametrize("suffix", ["png", "exr"])
+def test_grey_is_a_colour(tmp_path, channels, suffix):
+    codes = np.random.default_rng(0).integers(0, 256, SIZE, np.uint8)
+    path = tmp_path / f"a.1.{suffix}"
+    png(path, codes) if suffix == "png" else write_exr(path, codes.astype(np.float32))
+    (tmp_path / "jaxtrapolate.toml").write_text(
+        f'[buffers]\ncolor = {{ file = "a.{{frame}}.{suffix}"{channels} }}\nalbedo = "a.{{frame}}.{suffix}"\n'
+    )
+    sequence = open_sequence(tmp_path)
+    frame = sequence.frame(1)
+    for k in range(3):
+        expected = decode_srgb(codes) if suffix == "png" else codes
+        np.testing.assert_array_equal(frame.color[..., k], expected)
+        np.testing.assert_allclose(frame.gbuffer.albedo[..., k], codes / (255 if suffix == "png" else 1), rtol=1e-6)
+    notes = ["color has one channel and is taken for grey"] * (not channels)
+    assert list(sequence.notes) == [*notes, "albedo has one channel and is taken for grey"]
 
 
 def test_layer_that_is_not_there(tmp_path):
@@ -152,3 +202,22 @@ def test_layer_that_is_not_there(tmp_path):
     (tmp_path / "jaxtrapolate.toml").write_text('[buffers]\ndepth = { file = "multi.{frame}.exr", layer = "Mist" }\n')
     with pytest.raises(InputError, match=r"multi\.0001\.exr: needs 1 channel in layer 'Mist', has .*ViewLayer"):
         open_sequence(tmp_path).frame(1)
+
+
+def test_a_byte_order_mark(tmp_path):
+    write_exr(tmp_path / "1.exr", np.ones((*SIZE, 3)))
+    path = tmp_path / "jaxtrapolate.toml"
+    path.write_bytes(b'\xef\xbb\xbf[buffers]\ncolor = "{frame}.exr"\n')
+    assert open_sequence(tmp_path).numbers == (1,)
+    path.write_bytes('[buffers]\ncolor = "{frame}.exr"\n'.encode("utf-16"))
+    with pytest.raises(InputError, match="it is no UTF-8 text; save it as UTF-8"):
+        open_sequence(tmp_path)
+
+
+@pytest.mark.parametrize("path", [r"'sub\b.{frame}.exr'", r"'.\sub\b.{frame}.exr'", r'"sub\\b.{frame}.exr"'])
+def test_what_is_to_be_written_for_a_backslash(tmp_path, path):
+    """Single quotes, and two of them in double quotes, are read as forward slashes."""
+    (tmp_path / "sub").mkdir()
+    write_exr(tmp_path / "sub" / "b.1.exr", np.ones((*SIZE, 3)))
+    (tmp_path / "jaxtrapolate.toml").write_text(f"[buffers]\ncolor = {path}\n")
+    assert (open_sequence(tmp_path).frame(1).color == 1).all()

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from jaxtrapolate.files.convention import convert, unconvert
-from jaxtrapolate.files.repair import FAR, LOST, fill_nearest, repair
+from jaxtrapolate.files.repair import LOST, fill_nearest, no_depth, repair
 from jaxtrapolate.files.sequence import InputError, MotionConvention
+from jaxtrapolate.motion import convert_motion
 
 
 def test_finite_buffers_are_left_alone():
@@ -55,24 +56,51 @@ def test_invalid_pixel_becomes_a_hole():
     assert (out["position"][valid] == 1).all()
 
 
-def test_infinite_depth_is_the_sky():
-    depth = np.array([[[5], [np.inf]]], np.float32)
-    position = np.array([[[1, 2, 3], [np.nan, np.inf, 4]]], np.float32)
+def column(*values):
+    return np.array(values, np.float32).reshape(1, -1, 1)
+
+
+@pytest.mark.parametrize("empty", [np.inf, 0.0, -0.0, -1.0, -1e30])
+def test_where_nothing_was_hit_depth_is_infinite(empty):
+    depth, position = column(5, empty), np.array([[[1, 2, 3], [np.nan, np.inf, 4]]], np.float32)
     out, invalid = repair({"depth": depth, "position": position})
     assert invalid is None
-    np.testing.assert_array_equal(out["sky"], [[[0], [1]]])
-    np.testing.assert_array_equal(out["depth"], [[[5], [FAR]]])
+    np.testing.assert_array_equal(out["depth"], column(5, np.inf))
+    np.testing.assert_array_equal(out["sky"], column(0, 1))
     np.testing.assert_array_equal(out["position"], [[[1, 2, 3], [0, 0, 4]]])
+    assert no_depth({"depth": depth}) == {"infinite" if empty > 0 else "not positive": 1}
 
 
-def test_a_mask_of_the_sky_is_kept():
-    depth, sky = np.full((1, 2, 1), np.inf, np.float32), np.array([[[1], [0]]], np.float32)
-    normal = np.full((1, 2, 3), np.nan, np.float32)
-    out, invalid = repair({"depth": depth, "sky": sky, "normal": normal})
+def test_depth_under_the_sky_mask_is_infinite():
+    depth, sky = column(5, 1e7, 3, np.nan, -1), column(0, 1, 0.51, 1, 0)
+    out, invalid = repair({"depth": depth, "sky": sky})
+    assert invalid is None
     assert out["sky"] is sky
+    np.testing.assert_array_equal(out["depth"], column(5, *[np.inf] * 4))
+    assert no_depth({"depth": depth, "sky": sky}) == {"not positive": 1, "under the sky mask": 3}
+
+
+def test_nothing_needs_no_normal():
+    depth, sky = column(np.inf, np.inf, 2), column(1, 0, 0)
+    normal = np.full((1, 3, 3), np.nan, np.float32)
+    out, invalid = repair({"depth": depth, "sky": sky, "normal": normal})
     assert invalid is not None
-    np.testing.assert_array_equal(invalid, [[False, True]])
-    np.testing.assert_array_equal(out["normal"], np.zeros((1, 2, 3)))
+    np.testing.assert_array_equal(invalid, [[False, False, True]])
+    np.testing.assert_array_equal(out["normal"], np.zeros((1, 3, 3)))
+
+
+def test_the_mask_follows_in_every_frame_or_in_none():
+    depth = column(1, 2)
+    np.testing.assert_array_equal(repair({"depth": depth})[0]["sky"], column(0, 0))
+    assert "sky" not in repair({"depth": depth}, sky=False)[0]
+    assert "sky" not in repair({"motion": np.zeros((1, 2, 2), np.float32)})[0]
+
+
+def test_depth_that_is_nowhere_known_is_far():
+    out, invalid = repair({"depth": column(np.nan, -np.inf)})
+    assert invalid is not None
+    assert invalid.all()
+    np.testing.assert_array_equal(out["depth"], column(np.inf, np.inf))
 
 
 @pytest.mark.parametrize("sign", ["previous_minus_current", "current_minus_previous"])
@@ -84,6 +112,8 @@ def test_convention(sign, units, span, y_axis):
     s, up = (-1 if sign == "current_minus_previous" else 1), (-1 if y_axis == "up" else 1)
     expected = motion.astype(np.float64) * [s * span[0], s * up * span[1]]
     np.testing.assert_allclose(convert(motion, convention), expected, rtol=1e-6)
+    same = convert_motion(motion, sign=sign, units=units, y_axis=y_axis)
+    np.testing.assert_allclose(convert(motion, convention), same, rtol=1e-6)
     np.testing.assert_allclose(unconvert(convert(motion, convention), convention), motion, rtol=1e-6)
     assert MotionConvention.parse(str(convention)) == convention
 

@@ -6,7 +6,7 @@ import os
 import pytest
 
 from jaxtrapolate.files import InputError, open_sequence
-from jaxtrapolate.files.pattern import read_settings
+from jaxtrapolate.files.description import read_settings
 from jaxtrapolate.files.text import read_json, read_toml
 from jaxtrapolate.training.config import load_config
 

@@ -32,7 +32,7 @@ def example(size, seed=0):
     fields["sky"] = (rng.random((*size, 1)) < 0.3).astype(np.float32)
     fields["normal"] = np.where(fields["sky"] == 1, 0, fields["normal"]).astype(np.float32)
     fields["stencil"] = rng.integers(0, 4, (*size, 1)).astype(np.float32)
-    fields["depth"] = (rng.random((*size, 1)) * 5000).astype(np.float32)
+    fields["depth"] = np.where(fields["sky"] == 1, np.inf, rng.random((*size, 1)) * 5000 + 1).astype(np.float32)
     fields["position"] = (rng.normal(size=(*size, 3)) * 5000).astype(np.float32)
     motion = rng.normal(size=(*size, 2)).astype(np.float32)
     flow = rng.normal(size=(2, *size, 3)).astype(np.float32)
@@ -50,7 +50,7 @@ def test_round_trip(tmp_path, size):
     paths = write_unreal_frame(tmp_path / "new" / "dump", "Town", 3, frame, keyframe=keyframe)
     assert sorted(path.name for path in paths) == sorted(os.listdir(tmp_path / "new" / "dump"))
     sequence = UnrealSequence(tmp_path / "new" / "dump")
-    assert (sequence.name, sequence.numbers, sequence.size) == ("Town", (3,), size)
+    assert (sequence.name, sequence.numbers, sequence.size) == ("new/dump (Town)", (3,), size)
     assert (sequence.hdr, sequence.depth, sequence.forward_motion) == (True, "metric", True)
     back = sequence.frame(3)
     assert back.time == 3
@@ -107,7 +107,7 @@ def test_files_of_an_engine(tmp_path):
     same(frame.color[1, 1], [1, 2, 3])
     same(frame.motion[0, 0], [-3, 5])  # The previous frame's pixel: x - mv.x, y + mv.y with rows downwards.
     same(sequence.stored_motion(7)[0, 0], [3, 5])
-    same(frame.gbuffer.depth, 500 * np.ones((2, 3, 1)), rtol=1e-6)
+    same(frame.gbuffer.depth[..., 0], [[np.inf, 500, 500], [500, 500, 500]], rtol=1e-6)
     same(frame.gbuffer.roughness, 0.5 * np.ones((2, 3, 1)))
     same(frame.gbuffer.sky[..., 0], [[1, 0, 0], [0, 0, 0]])
     same(frame.gbuffer.normal[0, :2], [[0, 0, 0], [0, 0, 1]])
@@ -186,7 +186,7 @@ def test_largest_float_as_depth_of_the_sky(tmp_path):
     store(tmp_path, "A", "SceneDepth", 1, np.array([[1e-2, np.finfo(np.float32).max, np.inf]]))
     gbuffer = UnrealSequence(tmp_path).frame(1).gbuffer
     same(gbuffer.sky[..., 0], [[0, 1, 1]])
-    assert np.isfinite(gbuffer.depth).all()
+    same(gbuffer.depth[..., 0], [[100, np.inf, np.inf]], rtol=1e-6)
 
 
 def test_frames_are_read_only(tmp_path):

@@ -19,6 +19,12 @@ def test_configuration_from_a_table():
     assert made.pool % made.batch == 0
 
 
+def test_a_byte_order_mark(tmp_path):
+    path = tmp_path / "run.toml"
+    path.write_bytes(b'\xef\xbb\xbftask = "toy"\nsteps = 3\n[options]\ncrop = [4, 5]\n')
+    assert load_config(path).steps == 3
+
+
 @pytest.mark.parametrize(
     "change, message",
     [

@@ -6,7 +6,8 @@ from typing import Any
 
 from jaxtrapolate.commands.inputs import add_fresh, check_count, check_seed, parse_size, progress, terminal
 from jaxtrapolate.files import InputError, write_unreal_frame
-from jaxtrapolate.files.reader import list_folder, stored_size
+from jaxtrapolate.files.listing import list_folder
+from jaxtrapolate.files.reader import stored_size
 from jaxtrapolate.files.unreal import unreal_files
 from jaxtrapolate.output import open_output
 
@@ -55,7 +56,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _whole(folder: Path, scene: str, size: tuple[int, int]) -> set[int]:
     """The frames whose files are all there, in full: those that any frame has, and the one that is written last."""
-    frames = unreal_files(list_folder(folder)).get(scene, {})
+    frames, _ = unreal_files(list_folder(folder)).get(scene, ({}, []))
     needed = {"backward_flow"}.union(*frames.values())
 
     def readable(name: str) -> bool:

@@ -8,20 +8,22 @@ are opened where they are regular ones (`regular`) and hold no more pixels than 
 import itertools
 import os
 from pathlib import Path
+from typing import Any
 
+from jaxtrapolate.files.description import SETTINGS_NAME as SETTINGS_NAME
+from jaxtrapolate.files.description import read_settings
 from jaxtrapolate.files.exr import read_exr as read_exr
 from jaxtrapolate.files.exr import write_exr as write_exr
 from jaxtrapolate.files.image import read_png as read_png
 from jaxtrapolate.files.image import write_frame as write_frame
 from jaxtrapolate.files.image import write_png as write_png
+from jaxtrapolate.files.listing import list_folder
 from jaxtrapolate.files.packed import CONVENTION as _PACKED
 from jaxtrapolate.files.packed import PackedSequence as PackedSequence
 from jaxtrapolate.files.packed import packed_folder
-from jaxtrapolate.files.pattern import SETTINGS_NAME as SETTINGS_NAME
 from jaxtrapolate.files.pattern import PatternSequence as PatternSequence
-from jaxtrapolate.files.pattern import read_settings
 from jaxtrapolate.files.prefetch import prefetch as prefetch
-from jaxtrapolate.files.reader import FileSequence, list_folder
+from jaxtrapolate.files.reader import FileSequence
 from jaxtrapolate.files.sequence import InputError as InputError
 from jaxtrapolate.files.sequence import MotionConvention as MotionConvention
 from jaxtrapolate.files.sequence import Sequence as Sequence
@@ -48,8 +50,8 @@ def open_sequence(
         motion: how the motion vectors are stated, e.g. "current_minus_previous,pixels,up"; what a text does not say
             is the TOML file's, or the reader's default. Goes before the TOML file.
         settings: the TOML file, where it is not `jaxtrapolate.toml` in the folder.
-        strict: refuse gaps in the numbering now, and a frame with a pixel that is not finite, or of alpha 0, when it is
-            read.
+        strict: refuse gaps in the numbering and files that are left out now, and a frame with a pixel that is not
+            finite, or of alpha 0, when it is read.
 
     Raises:
         InputError: one line that names the file and the remedy: no such folder, a file, an empty folder, nothing that
@@ -69,36 +71,64 @@ def open_sequence(
         base = base if stated is None else stated.convention(base)
         return MotionConvention.parse(motion, base=base) if isinstance(motion, str) else motion or base
 
+    also: dict[str, Any] = {"strict": strict}
     sequence: FileSequence
     if stated is not None and stated.buffers:
         own = convention(MotionConvention())
-        sequence = PatternSequence(folder, settings=stated, motion=own, strict=strict)
-    elif unreal_files(names):
-        sequence = UnrealSequence(folder, motion=convention(_UNREAL), strict=strict)
+        sequence = PatternSequence(folder, settings=stated, motion=own, **also)
+        return _without_gaps(sequence) if strict else sequence
+    if stated is not None:
+        also |= {"name": stated.name, "step": stated.step, "static_ids": stated.static_ids}
+    if unreal_files(names):
+        sequence = UnrealSequence(folder, motion=convention(_UNREAL), **also)
     elif packed_folder(folder) is not None:
-        sequence = PackedSequence(folder, motion=convention(_PACKED), strict=strict)
+        sequence = PackedSequence(folder, motion=convention(_PACKED), **also)
     else:
         kinds = "<Scene><Buffer>.<0000>.exr, or color/ and motion/ with NNNN.png"
         raise InputError(f"{folder}: no frames found ({kinds}); describe its files in a {SETTINGS_NAME}")
-    if strict and (missing := gaps(sequence)):
+    return _without_gaps(sequence) if strict else sequence
+
+
+def _without_gaps(sequence: FileSequence) -> FileSequence:
+    if missing := gaps(sequence):
         first = missing[0]
         span = f"frame {first[0]}" if len(first) == 1 else f"frames {first[0]} to {first[-1]}"
-        raise InputError(f"{folder}: {span} missing; render what is missing, or read it without strict")
+        raise InputError(f"{sequence.folder}: {span} missing; render what is missing, or read it without strict")
     return sequence
 
 
 def runs(sequence: Sequence) -> tuple[range, ...]:
-    """The stretches of the numbering without a gap, in order; together they are all of `sequence.numbers`."""
+    """The stretches of the numbering without a gap, in order; together they are all of `sequence.numbers`.
+
+    A range has the sequence's step: `range(0, 6, 2)` is the frames 0, 2, 4. Neighbours are those next to each other in
+    a run, `run[i]` and `run[i + 1]`; their numbers differ by the step.
+    """
     out: list[range] = []
     for number in sequence.numbers:
         if out and number == out[-1].stop:
-            out[-1] = range(out[-1].start, number + 1)
+            out[-1] = range(out[-1].start, number + sequence.step, sequence.step)
         else:
-            out.append(range(number, number + 1))
+            out.append(range(number, number + sequence.step, sequence.step))
     return tuple(out)
 
 
 def gaps(sequence: Sequence) -> tuple[range, ...]:
     """The missing numbers between the first and the last frame, a range for each gap; a gap resets the history."""
     stretches = runs(sequence)
-    return tuple(range(a.stop, b.start) for a, b in itertools.pairwise(stretches))
+    return tuple(range(a.stop, b.start, sequence.step) for a, b in itertools.pairwise(stretches))
+
+
+def around(sequence: Sequence, number: int, *, before: int = 0, behind: int = 0) -> tuple[int, ...]:
+    """The numbers of `before` frames before a frame, its own, and of `behind` frames behind it, without a gap.
+
+    Raises:
+        ValueError: the frame is not there, or there are not so many without a gap.
+    """
+    for run in runs(sequence):
+        if number in run:
+            i = run.index(number)
+            if i >= before and i + behind < len(run):
+                return tuple(run[i - before : i + behind + 1])
+            text = f"expected {before} frames before and {behind} behind it without a gap, got {i} and"
+            raise ValueError(f"number {number}: {text} {len(run) - i - 1}")
+    raise ValueError(f"number: expected one of the sequence's frames, got {number}")

@@ -1,12 +1,11 @@
-"""Motion vectors between the convention of a file and the library's own; the arithmetic is `convert_motion`'s."""
+"""Motion vectors between the convention of a file and the library's own; the arithmetic is `convert_motion`'s.
 
-import dataclasses
-import functools
+Plain NumPy: what reads files computes nothing with JAX, so that a data loader may fork its workers after JAX was used.
+"""
 
 import numpy as np
 
 from jaxtrapolate.files.sequence import MotionConvention
-from jaxtrapolate.motion import convert_motion
 
 
 def convert(motion: np.ndarray, convention: MotionConvention) -> np.ndarray:
@@ -22,8 +21,9 @@ def unconvert(motion: np.ndarray, convention: MotionConvention) -> np.ndarray:
     return np.asarray(motion, np.float32) / _factors(convention, *motion.shape[:2])
 
 
-@functools.lru_cache(maxsize=16)
 def _factors(convention: MotionConvention, height: int, width: int) -> np.ndarray:
     """What a vector (1, 1) becomes; the conversion is linear in each component."""
-    ones = np.ones((height, width, 2), np.float32)
-    return np.array(convert_motion(ones, **dataclasses.asdict(convention))[0, 0])
+    span = {"pixels": (1.0, 1.0), "uv": (width, height), "ndc": (width / 2, height / 2)}[convention.units]
+    forward = -1.0 if convention.sign == "current_minus_previous" else 1.0
+    down = -1.0 if convention.y_axis == "up" else 1.0
+    return np.array([span[0] * forward, span[1] * forward * down], np.float32)

@@ -117,6 +117,22 @@ def _place(pixels: np.ndarray, part: ExrPart) -> np.ndarray:
     return out
 
 
+def exr_outside(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """For every channel of an EXR file the pixels outside its data window, bool `[H, W]`; empty where there is none."""
+    parts = read_header(path)
+    masks: dict[str, np.ndarray] = {}
+    if all(part.data == part.display for part in parts):
+        return masks
+    for part in parts:
+        height, width = part.size
+        x, y = part.data[0] - part.display[0], part.data[1] - part.display[1]
+        right, bottom = part.data[2] - part.display[0] + 1, part.data[3] - part.display[1] + 1
+        outside = np.ones((height, width), bool)
+        outside[max(y, 0) : max(bottom, 0), max(x, 0) : max(right, 0)] = False
+        masks |= {_full_name(part, name, parts): outside for name in part.channels}
+    return masks if any(mask.any() for mask in masks.values()) else {}
+
+
 def layer_channels(names: Sequence[str], layer: str = "") -> tuple[str, ...]:
     """The channels of a layer in their usual order: RGBA, XYZ, UVW, Y, Z, else by name.
 
@@ -146,6 +162,7 @@ def pick(
     count: int,
     layer: str = "",
     channels: Sequence[str] | None = None,
+    exact: bool = False,
 ) -> np.ndarray:
     """`count` channels of a layer as float32 `[H, W, count]`, from what `read_exr` gave.
 
@@ -155,6 +172,7 @@ def pick(
         count: how many; the first ones of the layer, so one channel stored as grey RGB is found as well.
         layer: its name, or the end of it; "" is the unnamed layer, or the only one.
         channels: their names within the layer, where the first ones in the usual order are not meant.
+        exact: 32-bit integers stay what they are, for float32 does not hold all of them.
 
     Raises:
         InputError: naming the channels that are there.
@@ -169,7 +187,10 @@ def pick(
     if len(names) < count:
         have = ", ".join(stored)
         raise InputError(f"{path}: needs {wanted}, has {have}; name the layer and channels in a jaxtrapolate.toml")
-    return quiet(np.stack([stored[name].astype(np.float32) for name in names[:count]], axis=-1))
+    planes = [stored[name] for name in names[:count]]
+    if exact and all(plane.dtype == np.uint32 for plane in planes):
+        return np.stack(planes, axis=-1)
+    return quiet(np.stack([plane.astype(np.float32) for plane in planes], axis=-1))
 
 
 def quiet(image: np.ndarray) -> np.ndarray:

@@ -4,29 +4,36 @@
 - motion: RGBA; with R to A in 0..1, (2 (R + G / 255) - 1, 2 (B + A / 255) - 1) is current minus previous as a fraction
   of the frame, y up. That is what `stored_motion` gives; its convention is "current_minus_previous,uv,up", so that
   previous = (x - mv_x, y - mv_y) with mv_x = (2 (R + G / 255) - 1) W and mv_y = -(2 (B + A / 255) - 1) H.
-- depth: larger = nearer in the files. Ordinal only: 1 - code / 255 is given, larger = farther, and no distances.
-- stencil: 0 static, else dynamic. A mask's 255 becomes the id 1, other codes are ids as they are.
+- depth: larger = nearer in the files. Ordinal only: (256 - code) / 256 is given, larger = farther, and no distances;
+  it is positive, since the nearest code, 255, is a surface like others and not "nothing hit".
+- stencil: 0 static, else dynamic. A mask's 255 becomes the id 1 (and 1, should it be there too, 255); other codes are
+  ids as they are.
 - shadow: 255 = full shadow, so code / 255. (In the known clip the mask also marks some static surfaces.)
 
-Every folder is optional, but there must be color or motion.
+Every folder is optional, but there must be color or motion. Numbers may be negative; a file with another name is left
+out, and so is 1.png where there is 0001.png; notes name them.
 """
 
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from jaxtrapolate.files.alpha import without_empty
+from jaxtrapolate.files.ids import StaticId
 from jaxtrapolate.files.image import decode_srgb, read_png
-from jaxtrapolate.files.reader import FileSequence, Opened, frame_number, list_folder
+from jaxtrapolate.files.listing import collect, folder_name, frame_number, list_folder, some
+from jaxtrapolate.files.reader import FileSequence, Opened
 from jaxtrapolate.files.sequence import InputError, MotionConvention
 
 FOLDERS = ("color", "motion", "depth", "stencil", "shadow")
 CONVENTION = MotionConvention("current_minus_previous", "uv", "up")
 """How a packed clip states its motion vectors, once they are decoded."""
 
-_FILE = re.compile(r"(\d+)\.png", re.IGNORECASE)
+_FILE = re.compile(r"(-?\d+)\.png", re.IGNORECASE)
+_OTHER = re.compile(r".*\d\.(png|jpe?g|exr|tiff?|webp|bmp|tga)", re.IGNORECASE)
 _CHANNELS = {"color": 3, "motion": 4, "depth": 1, "stencil": 1, "shadow": 1}
 
 
@@ -54,6 +61,8 @@ class PackedSequence(FileSequence):
     Args:
         folder: that with the folders `color`, `motion`, ..., or one whose only subfolder with `motion` it is.
         motion: how the decoded motion vectors are stated, where it is not the default `CONVENTION`.
+        name: for reports; by default the folder's.
+        step, static_ids: as in `FileSequence`.
         strict: as for the other readers; 8-bit files have no non-finite pixels.
 
     Raises:
@@ -65,27 +74,42 @@ class PackedSequence(FileSequence):
         folder: str | os.PathLike[str],
         *,
         motion: MotionConvention | None = None,
+        name: str | None = None,
+        step: int | None = None,
+        static_ids: Iterable[StaticId] = (),
         strict: bool = False,
     ) -> None:
         clip = packed_folder(folder)
         if clip is None:
             raise InputError(f"{folder}: no folders color or motion of NNNN.png; give the folder of the clip")
-        files: dict[int, dict[str, str]] = {}
+        found, others = [], []
         for buffer in FOLDERS:
-            for name in list_folder(clip / buffer) if (clip / buffer).is_dir() else ():
-                if match := _FILE.fullmatch(name):
-                    files.setdefault(frame_number(match[1], name), {})[buffer] = os.path.join(buffer, name)
+            for file in list_folder(clip / buffer) if (clip / buffer).is_dir() else ():
+                path = os.path.join(buffer, file)
+                if match := _FILE.fullmatch(file):
+                    number = frame_number(match[1], path)
+                    found.append((number, buffer, path, match[1] == f"{number:04d}"))
+                elif _OTHER.fullmatch(file):
+                    others.append(path)
+        files, left_out = collect(found)
+        if others:
+            left_out.append(f"{some(others)} left out: a packed clip's files are named NNNN.png")
         if not files:
             raise InputError(f"{clip}: its folders hold no files named NNNN.png; give the folder of the clip")
         super().__init__(
             clip,
             files,
-            name=Path(folder).resolve().name,
+            name=name or folder_name(folder),
             hdr=False,
             depth="ordinal",
             convention=motion or CONVENTION,
+            step=step,
+            static_ids=static_ids,
+            left_out=left_out,
             strict=strict,
         )
+        if unread := [name for name in list_folder(clip) if name not in FOLDERS and (clip / name).is_dir()]:
+            self.notes += (f"{some(unread)} not read: a packed clip's folders are {', '.join(FOLDERS)}",)
 
     def _read(self, path: Path, buffer: str, opened: Opened) -> np.ndarray:
         codes = read_png(path)
@@ -100,10 +124,18 @@ class PackedSequence(FileSequence):
         if buffer == "motion":
             return decode_motion(codes)
         if buffer == "depth":
-            return 1.0 - codes.astype(np.float32) / 255.0
+            return (256 - codes.astype(np.float32)) / 256
         if buffer == "stencil":
-            return np.where(codes == 255, 1, codes).astype(np.float32)
+            return codes
         return codes.astype(np.float32) / 255.0
+
+    def _number(self, values: np.ndarray) -> np.ndarray:
+        ids = super()._number(values)
+        return np.where(ids == 255, 1, np.where(ids == 1, 255, ids)).astype(np.float32)
+
+    def stored_id(self, number: int) -> StaticId:
+        """An id of the stencil as it is stored: 255 for 1, and 1 for 255."""
+        return {1: 255, 255: 1}.get(number, number)
 
 
 def decode_motion(codes: np.ndarray) -> np.ndarray:

@@ -75,14 +75,17 @@ class Sequence(abc.ABC):
 
     Attributes:
         name: of the input, for reports.
-        numbers: of the frames that are there, ascending; a gap resets a method's history.
+        numbers: of the frames that are there, ascending, negative ones too; a gap resets a method's history.
+        step: how far apart the numbers of neighbouring frames are (2 where every second frame was rendered); gaps and
+            runs are counted in it, and motion leads to the frame `step` before.
         size: `(H, W)`.
         hdr: whether colour is HDR (scored after x / (1 + x) and gamma 1 / 2.2, written as EXR) or 8-bit sRGB
             (scored in sRGB, written as PNG). `Frame.color` is linear either way.
         convention: how the stored motion vectors are stated; `frame` has converted them.
         depth: "metric" (in the unit of position), "ordinal" (larger = farther, and no more than that) or "absent".
         forward_motion: whether `keyframe` gives flows to the next frame as well.
-        notes: what the reader did that a user should know, one line each ("frame 0 left out: ...").
+        notes: what the reader did that a user should know, one line each ("frame 0 left out: ..."); reading frames may
+            add to it.
     """
 
     name: str
@@ -91,14 +94,16 @@ class Sequence(abc.ABC):
     hdr: bool
     convention: MotionConvention
     depth: Literal["metric", "ordinal", "absent"]
+    step: int = 1
     forward_motion: bool = False
     notes: tuple[str, ...] = ()
 
     @abc.abstractmethod
     def frame(self, number: int) -> Frame:
-        """The frame with every buffer that is there; colour `None` where only buffers were drawn.
+        """The frame with every buffer that is there; colour `None` where only buffers were drawn; time its number.
 
-        Non-finite pixels have been replaced as `jaxtrapolate.files.repair` says.
+        Depth is +inf where nothing was hit, and ids of the stencil are integers that float32 tells apart. Non-finite
+        pixels have been replaced as `jaxtrapolate.files.repair` says.
         """
 
     def files(self, number: int) -> Mapping[str, Path]:
@@ -135,6 +140,14 @@ class Sequence(abc.ABC):
         They hold made-up values (`jaxtrapolate.files.repair`), so scores leave them out.
         """
         return None
+
+    def no_depth(self, number: int) -> dict[str, int]:
+        """How many pixels of the frame have no depth and are taken for infinitely far, by why ("not positive", ...)."""
+        return {}
+
+    def stored_id(self, number: int) -> int | str:
+        """An id of the stencil as the input states it: a number, or the hexadecimal digits of its bits."""
+        return number
 
     def nonfinite(self, number: int) -> int:
         """How many pixels of the frame had a non-finite value in some buffer, or alpha 0."""

@@ -13,6 +13,8 @@ from jaxtrapolate.files.sequence import InputError
 
 LARGEST = 1 << 20
 """Bytes: no file of settings is larger."""
+BACKSLASH = "forward slashes, or single quotes around it, since in double quotes a backslash starts an escape"
+"""How paths are written in TOML."""
 _DEEPEST = 64
 _LONG_KEY = re.compile(r"""(?m)(?:^|[\[{,])[ \t]*(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){65}""")
 """A key of more than 64 parts, which takes tomllib a time that grows with the square of them."""
@@ -52,8 +54,13 @@ def _read(path: str | os.PathLike[str], kind: str, parse: Callable[[str], Any]) 
         check_values(value)
     except RecursionError as error:
         raise InputError(f"{path}: not valid {kind}, nested too deeply; correct it") from error
-    except ValueError as error:  # also what is no UTF-8, and a number of thousands of digits
-        raise InputError(f"{path}: not valid {kind}, {' '.join(str(error).split())}; correct it") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not valid {kind}, it is no UTF-8 text; save it as UTF-8") from error
+    except ValueError as error:  # also a number of thousands of digits
+        why = " ".join(str(error).split())
+        escape = kind == "TOML" and ("scape" in why or "hex" in why)
+        remedy = f"write paths with {BACKSLASH}" if escape else "correct it"
+        raise InputError(f"{path}: not valid {kind}, {why}; {remedy}") from error
     return value
 
 

@@ -11,26 +11,34 @@
 | Roughness, Metallic, Specular, NoV | roughness, metallic, specular, n_dot_v | |
 | MyStencil | stencil | 0 static, > 0 the id of a dynamic object |
 | Shadow | shadow | 1 = light fully blocked by dynamic objects |
-| Sky | sky | 1 = nothing hit; without it the sky is where the normal is (-1, -1, -1) |
+| Sky | sky | 1 = nothing hit; without it the sky is where the normal is (-1, -1, -1) or there is no depth |
 | Skybox or SkyboxColor | sky_color | linear radiance |
 | ForwardFlow, BackwardFlow | of the keyframe | R, G: pixels to add, y down; B: change of depth in metres |
 
 The unit of position, and so of depth and of its changes, is the centimetre. Buffers of one channel may be stored with
-one or as grey with three. Frame 0000, which the release of ExtraNet drops, is kept: it serves as history. Only a first
-frame that has no MotionVector at all, while others have, is left out (`FileSequence.notes`).
+one or as grey with three, colours as one channel of grey. Depth is +inf where the sky is, whatever is stored there, and
+where it is not positive (`jaxtrapolate.files.repair`). Numbers may be negative; where two files are of one frame, as
+`.1.exr` and `.0001.exr`, one is left out, and a note says which; another note names EXR files of no known buffer. Frame
+0000, which the release of ExtraNet drops, is kept: it serves as history. Only a first frame that has no MotionVector at
+all, while others have, is left out (`FileSequence.notes`).
 """
 
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from jaxtrapolate.files.atomic import os_input_error
 from jaxtrapolate.files.convention import unconvert
-from jaxtrapolate.files.exr import pick, read_exr, write_exr
-from jaxtrapolate.files.reader import BUFFERS, FLOWS, FileSequence, Opened, frame_number, list_folder
+from jaxtrapolate.files.exr import read_exr, write_exr
+from jaxtrapolate.files.ids import StaticId
+from jaxtrapolate.files.listing import Files, collect, folder_name, frame_number, list_folder, some
+from jaxtrapolate.files.reader import BUFFERS, FLOWS, FileSequence, Opened, pick_channels
+from jaxtrapolate.files.repair import nothing_hit
 from jaxtrapolate.files.sequence import InputError, MotionConvention
 from jaxtrapolate.records import Frame, Keyframe, check_frame
 
@@ -58,23 +66,26 @@ CONVENTION = MotionConvention("current_minus_previous", "pixels", "up")
 """How an Unreal dump states its motion vectors."""
 
 _FIELDS = {name: field for field, name in NAMES.items()} | {"SkyboxColor": "sky_color"}
-_FILE = re.compile(rf"(?P<scene>.*?)(?P<buffer>{'|'.join(_FIELDS)})\.(?P<number>\d+)\.exr", re.IGNORECASE)
+_FILE = re.compile(rf"(?P<scene>.*?)(?P<buffer>{'|'.join(_FIELDS)})\.(?P<number>-?\d+)\.exr", re.IGNORECASE)
+_OTHER = re.compile(r".*\.-?\d+\.exr", re.IGNORECASE)
 _LOWER = {name.lower(): field for name, field in _FIELDS.items()}
 
 _DEPTH_TO_CM = 1e4
 _METRES_TO_CM = 100.0
 _SKY_NORMAL = -1.0
-_SINGLE = ("motion", "position", "depth", *FLOWS)
+_SINGLE = ("motion", "position", "depth", "stencil", *FLOWS)
 
 
-def unreal_files(names: list[str]) -> dict[str, dict[int, dict[str, str]]]:
-    """For each scene and frame the file of each buffer, from the names in a folder; others are ignored."""
-    scenes: dict[str, dict[int, dict[str, str]]] = {}
+def unreal_files(names: list[str]) -> dict[str, tuple[Files, list[str]]]:
+    """For each scene the file of each buffer by frame, and a line for each that is left out (`collect`)."""
+    scenes: dict[str, list[tuple[int, str, str, bool]]] = {}
     for name in names:
         if match := _FILE.fullmatch(name):
-            files = scenes.setdefault(match["scene"], {}).setdefault(frame_number(match["number"], name), {})
-            files[_LOWER[match["buffer"].lower()]] = name
-    return scenes
+            number = frame_number(match["number"], name)
+            usual = match["number"] == f"{number:04d}" and match["buffer"] in _FIELDS
+            field = _LOWER[match["buffer"].lower()]
+            scenes.setdefault(match["scene"], []).append((number, field, name, usual))
+    return {scene: collect(found) for scene, found in scenes.items()}
 
 
 class UnrealSequence(FileSequence):
@@ -84,11 +95,14 @@ class UnrealSequence(FileSequence):
         folder: where the files are.
         scene: which one, where the folder holds several.
         motion: how the motion vectors are stated, where it is not the default `CONVENTION`.
-        strict: raise on reading a frame with a non-finite pixel.
+        name: for reports; by default the folder's, and the scene's in brackets where it differs.
+        step, static_ids, strict: as in `FileSequence`.
 
     Raises:
         InputError: no such folder, no such files, several scenes, a missing file, files of different sizes.
     """
+
+    outside = MappingProxyType({**FileSequence.outside, "normal": _SKY_NORMAL})
 
     def __init__(
         self,
@@ -96,29 +110,39 @@ class UnrealSequence(FileSequence):
         *,
         scene: str | None = None,
         motion: MotionConvention | None = None,
+        name: str | None = None,
+        step: int | None = None,
+        static_ids: Iterable[StaticId] = (),
         strict: bool = False,
     ) -> None:
-        scenes = unreal_files(list_folder(folder))
+        names = list_folder(folder)
+        scenes = unreal_files(names)
         if scene is None and len(scenes) > 1:
-            found = ", ".join(repr(name) for name in sorted(scenes))
+            found = ", ".join(map(repr, sorted(scenes)))
             raise InputError(f"{folder}: holds several scenes ({found}); put each into a folder of its own")
-        name = scene if scene is not None else next(iter(scenes), "")
-        if name not in scenes:
+        prefix = scene if scene is not None else next(iter(scenes), "")
+        if prefix not in scenes:
             of_scene = "" if scene is None else f" of scene {scene!r}"
             raise InputError(f"{folder}: no files{of_scene} named <Scene><Buffer>.<0000>.exr; give the dump's folder")
+        files, left_out = scenes[prefix]
         super().__init__(
             folder,
-            scenes[name],
-            name=name or Path(folder).name,
+            files,
+            name=name or folder_name(folder, prefix),
             hdr=True,
             depth="metric",
             convention=motion or CONVENTION,
+            step=step,
+            static_ids=static_ids,
+            left_out=left_out,
             strict=strict,
         )
+        if others := [file for file in names if _OTHER.fullmatch(file) and not _FILE.fullmatch(file)]:
+            self.notes += (f"{some(others)} not read: the names are of no buffer of an Unreal dump",)
 
     def _read(self, path: Path, buffer: str, opened: Opened) -> np.ndarray:
         stored = read_exr(path)
-        image = pick(stored, path=path, count=BUFFERS[buffer])
+        image = pick_channels(stored, path=path, buffer=buffer)
         if buffer == "color":
             return self._exr_color(path, image, stored)
         if buffer == "depth":
@@ -133,7 +157,8 @@ class UnrealSequence(FileSequence):
             return
         sky = (buffers["normal"] == _SKY_NORMAL).all(axis=-1, keepdims=True)
         buffers["normal"] = np.where(sky, np.float32(0), buffers["normal"])
-        buffers.setdefault("sky", sky.astype(np.float32))
+        if "sky" not in buffers:
+            buffers["sky"] = (sky | nothing_hit(buffers["depth"]) if "depth" in buffers else sky).astype(np.float32)
 
 
 def write_unreal_frame(
@@ -155,7 +180,7 @@ def write_unreal_frame(
         frame: in the library's conventions.
         keyframe: its flows are written too; its colour, depth and stencil are the frame's.
         unit: centimetres in a unit of position; the reader gives centimetres back.
-        half: 16-bit floats for colours, normals and materials. Motion, flows, position and depth are always 32-bit.
+        half: 16-bit floats for colours, normals and materials. Motion, flows, position, depth, ids are always 32-bit.
 
     Returns:
         The files.
@@ -197,7 +222,8 @@ def _encode_units(images: dict[str, np.ndarray], unit: float) -> None:
         if flow in images:
             images[flow][..., 2] *= np.float32(unit / _METRES_TO_CM)
     if "normal" in images and "sky" in images:
-        binary = np.isin(images["sky"], (0.0, 1.0)).all()
-        images["normal"] = np.where(images["sky"] == 1, np.float32(_SKY_NORMAL), images["normal"])
-        if binary:
+        sky = images["sky"] == 1
+        images["normal"] = np.where(sky, np.float32(_SKY_NORMAL), images["normal"])
+        follows = sky | nothing_hit(images["depth"]) if "depth" in images else sky
+        if (images["sky"] == follows).all():
             del images["sky"]

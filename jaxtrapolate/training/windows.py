@@ -252,9 +252,9 @@ class Windows:
     def _numbers(self, sequence: Sequence) -> list[int]:
         """The frames of a sequence that have all that a window needs around them."""
         before, behind = 2 * self._past - 1, max(0, 2 * self._future - 1)
-        numbers = [n for run in runs(sequence) for n in run[before : len(run) - behind]]
         needed = [0, *range(-before, 0, 2), *range(1, behind + 1, 2)]
-        numbers = [n for n in numbers if all(sequence.has_color(n + k) for k in needed)]
+        places = [(run, i) for run in runs(sequence) for i in range(before, len(run) - behind)]
+        numbers = [run[i] for run, i in places if all(sequence.has_color(run[i + k]) for k in needed)]
         if not numbers:
             raise InputError(f"{sequence.name}: has no {before + 1 + behind} frames in a row for a window")
         return numbers
