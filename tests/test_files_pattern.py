@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxtrapolate.files import InputError, MotionConvention, PatternSequence, open_sequence, pattern, write_exr
+from jaxtrapolate.files import (
+    InputError,
+    MotionConvention,
+    PatternSequence,
+    description,
+    open_sequence,
+    pattern,
+    write_exr,
+)
 from jaxtrapolate.files.image import decode_srgb
 
 SIZE = (4, 6)
@@ -38,7 +46,7 @@ def courtyard(folder, numbers=(1, 2)):
 
 
 def documented_example():
-    lines = (pattern.__doc__ or "").split("\n\n    name = ")[1].split("\n\nA buffer is")[0]
+    lines = (description.__doc__ or "").split("\n\n    name = ")[1].split("\n\nA buffer is")[0]
     return re.sub(r"^    ", "", "    name = " + lines, flags=re.MULTILINE)
 
 

@@ -153,7 +153,7 @@ def _values(
     places = [names.index(name) if name in names else -1 for name in (*wanted, *([spec.valid] if spec.valid else []))]
     if len(wanted) < count or min(places) < 0:
         text = f"needs {count} channels" + (f" ({', '.join(wanted)})" if spec.channels else "")
-        remedy = f'name {count} of them, such as channels = ["{names[0]}"' + f', "{names[0]}"' * (count - 1) + "]"
+        remedy = f'name {count} of them, such as channels = "{names[0] * count}"'
         raise InputError(f"{path}: {buffer} {text}, has {', '.join(names)}; in {settings}, {remedy}")
     stored = pixels[..., places[: len(wanted)]]
     if buffer == "stencil":

@@ -4,7 +4,8 @@ Where nothing was hit, depth is +inf, which is farther than anything. That is so
 
 - where it is stored as +inf, or is not positive: 0 or -1 is what renderers leave where no ray hit anything;
 - where the sky mask says so (above 0.5), whatever is stored there, NaN too;
-- outside an EXR's data window, and beyond the limits that `jaxtrapolate.toml` states (`jaxtrapolate.files.description`).
+- outside an EXR's data window, and beyond the limits that `jaxtrapolate.toml` states
+  (`jaxtrapolate.files.description`).
 
 An input without a mask of the sky is given the one that follows. Ordinal depth is positive by the time it comes here,
 since its nearest value may be stored as 0 (`jaxtrapolate.files.packed`, `jaxtrapolate.files.pattern`). Position and
