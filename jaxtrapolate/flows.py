@@ -17,6 +17,7 @@ from jaxtrapolate.assisted import DepthKind
 from jaxtrapolate.checks import Size, check_choice, check_image
 from jaxtrapolate.gather import sample, take_rows
 from jaxtrapolate.motion import camera_motion
+from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Camera, Keyframe, replace
 from jaxtrapolate.scatter import splat_source
 from jaxtrapolate.search import check_flow, positions, within
@@ -237,4 +238,4 @@ def complete_flows(previous: Keyframe, next: Keyframe, *, depth: DepthKind = "me
 
 
 def _wide(flow):
-    return flow.astype(jnp.promote_types(flow.dtype, jnp.float32))
+    return flow.astype(widest(flow))

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate import perceptual
 from jaxtrapolate.checks import check_choice, check_image, check_installed
+from jaxtrapolate.precision import widest
 
 _SIGMA = 1.5
 _RADIUS = 5  # an 11 x 11 window
@@ -31,7 +32,7 @@ def _mean(values, mask):
 
 
 def _squared_error(first, second, mask):
-    wide = jnp.promote_types(jnp.promote_types(first.dtype, second.dtype), jnp.float32)
+    wide = widest(first, second)
     first, second = first.astype(wide), second.astype(wide)
     if mask is not None:  # before the square, so that what is left out has no part in the gradient either
         first, second = jnp.where(mask > 0, first, 0), jnp.where(mask > 0, second, 0)
@@ -125,7 +126,7 @@ def ssim_map(
     height, width, _ = first.shape
     if height <= 2 * _RADIUS or width <= 2 * _RADIUS:
         raise ValueError(f"first: expected at least 11 x 11 pixels for SSIM's window, got {height} x {width}")
-    wide = jnp.promote_types(first.dtype, jnp.float32)
+    wide = widest(first)
     first, second = first.astype(wide), second.astype(wide)
     peak = jnp.asarray(peak, wide)
     c1, c2 = (0.01 * peak) ** 2, (0.03 * peak) ** 2

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image
 from jaxtrapolate.gather import all_finite, inside, pixel_grid, root, sample, where_finite
+from jaxtrapolate.precision import widest
 from jaxtrapolate.records import record
 from jaxtrapolate.strips import by_strips, rows_of
 
@@ -224,7 +225,7 @@ def _search_part(sources, top, rows, *, iterations, solver, filter):
 @partial(jax.jit, static_argnames=("iterations", "solver", "filter"))
 def _search(flow, fraction, start, *, iterations, solver, filter):
     """`iterative_search` without its checks."""
-    wide = jnp.promote_types(flow.dtype, jnp.float32)
+    wide = widest(flow)
     flow, fraction = flow.astype(wide), jnp.asarray(fraction).astype(wide)
     if start is not None:
         pixels = positions(flow.shape[0], flow.shape[1], wide)

@@ -69,7 +69,7 @@ H, W = 5, 7
 
 
 def gbuffer(albedo, normal, position):
-    ids = jnp.zeros((H, W, 1))
+    ids = jnp.zeros((H, W, 1), albedo.dtype)
     return jx.GBuffer(albedo=albedo, normal=normal, position=position, stencil=ids)
 
 

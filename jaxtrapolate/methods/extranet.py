@@ -33,6 +33,7 @@ from jaxtrapolate.methods.warping import guided_stage
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig, extranet_from_torch
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.networks.stored import load_network
+from jaxtrapolate.precision import widest
 from jaxtrapolate.radiance import By, demodulate, log_decode, log_encode
 from jaxtrapolate.records import GBuffer
 from jaxtrapolate.weights import configured, read_torch
@@ -141,7 +142,7 @@ def features(buffers: GBuffer | None, like: Float[Array, "h w c"], preparation: 
 
 def encode(image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
     """log(1 + r) in at least float32; what is negative or not finite counts as 0."""
-    image = image.astype(jnp.promote_types(image.dtype, jnp.float32))
+    image = image.astype(widest(image))
     return log_encode(jnp.where(jnp.isfinite(image), image, 0))
 
 
