@@ -22,6 +22,11 @@ _SIGMA = 1.5
 _RADIUS = 5  # an 11 x 11 window
 
 
+def _counts(mask):
+    """Where a mask, bool or weights, is more than nothing."""
+    return mask if mask.dtype == bool else mask > 0
+
+
 def _mean(values, mask):
     if mask is None:
         return jnp.mean(values)
@@ -35,7 +40,7 @@ def _squared_error(first, second, mask):
     wide = widest(first, second)
     first, second = first.astype(wide), second.astype(wide)
     if mask is not None:  # before the square, so that what is left out has no part in the gradient either
-        first, second = jnp.where(mask > 0, first, 0), jnp.where(mask > 0, second, 0)
+        first, second = (jnp.where(_counts(mask), image, 0) for image in (first, second))
     return _mean(jnp.square(first - second), mask)
 
 
@@ -214,8 +219,9 @@ class Metric:
         if self.name in METRICS:
             return float(self.function(image, reference, mask=jnp.asarray(mask)))
         _check(image, reference, mask)
-        reference = jnp.where(jnp.asarray(mask) > 0, reference, jnp.where(jnp.isfinite(reference), reference, 0))
-        return float(self.function(jnp.where(jnp.asarray(mask) > 0, image, reference), reference))
+        counts = _counts(jnp.asarray(mask))
+        reference = jnp.where(counts, reference, jnp.where(jnp.isfinite(reference), reference, 0))
+        return float(self.function(jnp.where(counts, image, reference), reference))
 
 
 _ALL = {

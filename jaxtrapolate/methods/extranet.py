@@ -225,13 +225,14 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
             colors = [history[i].color for i in rendered(history)][: len(motions)]
             same = [jnp.all(color == colors[0]) for color in colors[1:]]
             still = jnp.all(jnp.stack(same + [jnp.all(motion == 0) for motion in motions]))
-            image = jnp.where(still, values["histories"][0], image)
+            image = jnp.where(still, values["histories"][0].astype(image.dtype), image)
         return {"warped": image, "image": image, "guess": values["warped"]}
 
     def sky(state, values: Values):
+        image = values["image"]
         # the guided warp finds like sky where the occluder has moved on; the sky is not divided by anything
         plain = values["guess"] if guided and preparation.sky else composite(values, values["newest"].color)
-        return {"image": jnp.where(values["target"].gbuffer.sky > 0.5, plain, values["image"])}
+        return {"image": jnp.where(values["target"].gbuffer.sky > 0.5, plain.astype(image.dtype), image)}
 
     demodulation: dict[str, Any] = {"floor": preparation.floor, "sky": preparation.sky}
     past = max(1, config.histories)

@@ -135,7 +135,7 @@ class Layer(nnx.Module):
         if norm:
             self.norm = nnx.BatchNorm(outputs, momentum=0.9, epsilon=1e-5, use_fast_variance=False, rngs=rngs)
         if activation == "prelu":
-            self.slope = nnx.Param(jnp.full((outputs,), 0.25))
+            self.slope = nnx.Param(jnp.full((outputs,), 0.25, jnp.float32))
 
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b i j d"]:
         x = x.astype(self.feature.kernel.dtype)

@@ -82,7 +82,8 @@ def _cast(tree: Any, precision: str) -> Any:
 
 def _averaged(decay: float, count: Array, old: Any, new: Any) -> Any:
     """The running average after `count` steps; at first it forgets faster, so that it does not stay at the start."""
-    keep = jnp.minimum(decay, (1.0 + count) / (10.0 + count))
+    count = count.astype(jnp.float32)
+    keep = jnp.minimum(decay, (1 + count) / (10 + count))
     return jax.tree.map(lambda o, n: (o * keep + n * (1 - keep)).astype(o.dtype), old, new)
 
 
@@ -129,7 +130,7 @@ def make_step(task: Task, config: Config) -> Step:
         def one(part: Example, key: Any) -> Batch:
             choice, own = jax.random.split(key)
             (count,) = {a.shape[0] for a in jax.tree.leaves(part)}
-            index = jax.random.randint(choice, (), 0, count)
+            index = jax.random.randint(choice, (), 0, count, jnp.int32)
             return task.sample(jax.tree.map(lambda a: a[index], part), own)
 
         return jax.vmap(one)(parts, keys)
