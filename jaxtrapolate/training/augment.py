@@ -51,7 +51,7 @@ def _flip(frame: Frame, horizontal: Flag, vertical: Flag) -> Frame:
         return jnp.where(vertical, value[::-1], value)
 
     def signed(value: Any, *signs: Array) -> Array:
-        return value * jnp.stack(signs).astype(value.dtype)
+        return value * jnp.stack(signs).astype(value.dtype).reshape((1,) * (value.ndim - 1) + (-1,))
 
     fields: dict[str, Any] = {}
     for name in ("color", "motion"):
@@ -105,13 +105,12 @@ def crop(tree: T, key: PRNGKeyArray, *, size: Size, weight: Float[Array, "h w 1"
         choice, shift = jax.random.split(key)
         total = jnp.cumsum(jnp.where(jnp.isfinite(weight), weight, 0).reshape(-1) + _LEAST)
         chosen = jnp.searchsorted(total, total[-1] * jax.random.uniform(choice, (), total.dtype))
-        place = jnp.array(jnp.unravel_index(chosen, whole), jnp.int32) - jax.random.randint(
-            shift, (2,), 0, jnp.array(size, jnp.int32), jnp.int32
-        )
+        before = jax.random.randint(shift, (2,), 0, jnp.array(size, jnp.int32), jnp.int32)
+        place = jnp.array(jnp.unravel_index(chosen, whole), jnp.int32) - before
         top, left = jnp.clip(place, 0, room - 1)
 
     def cut(image: Array) -> Array:
-        zeros = (0,) * (image.ndim - 2)
+        zeros = (jnp.int32(0),) * (image.ndim - 2)
         return jax.lax.dynamic_slice(image, (top, left, *zeros), (*size, *image.shape[2:]))
 
     return jax.tree.map(cut, tree)

@@ -151,12 +151,14 @@ def make_step(task: Task, config: Config) -> Step:
             return loss.astype(jnp.float32), (statistics, rest, dict(metrics))
 
         (loss, (statistics, rest, metrics)), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.weights)
-        updates, moments = optimizer.update(gradient, state.moments, state.weights)
-        weights = optax.apply_updates(state.weights, updates)
+        with jax.numpy_dtype_promotion("standard"):  # which Optax counts on: it raises floats to counts of steps
+            updates, moments = optimizer.update(gradient, state.moments, state.weights)
+            weights = optax.apply_updates(state.weights, updates)
+            used = {"gradient": optax.tree.norm(gradient), "learning_rate": rate(state.step)}
         average = state.average
         if config.average is not None:
             average = _averaged(config.average, state.step, average, (weights, statistics))
-        metrics |= {"loss": loss, "gradient": optax.tree.norm(gradient), "learning_rate": rate(state.step)}
+        metrics |= {"loss": loss, **{name: jnp.asarray(value, jnp.float32) for name, value in used.items()}}
         made = replace(
             state,
             step=state.step + 1,
