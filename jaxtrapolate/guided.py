@@ -315,5 +315,6 @@ def far_motion(
     short = [(0, max(0, size - have)) for size, have in zip((height, width), further.shape, strict=False)]
     further = jnp.pad(further, (*short, (0, 0)), mode="edge")[:height, :width].astype(motion.dtype)
     there = backward_warp(source_guide, motion, filter="nearest")
-    differ = jnp.sum(jnp.square(target_guide - there), -1, keepdims=True) > unlike
+    apart = jnp.sum(jnp.square(target_guide - there), -1, keepdims=True)
+    differ = apart > jnp.asarray(unlike, apart.dtype)
     return jnp.where(holes & differ, motion + further, motion)

@@ -127,11 +127,12 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
     position = None
     if both["position"]:
         if absolute:
-            facing, grazing, per_depth = position_threshold
+            facing, grazing, per_depth = (jnp.asarray(a, target.position.dtype) for a in position_threshold)
             n_dot_v = 1.0 if target.n_dot_v is None else jnp.abs(target.n_dot_v)
             limit = facing * n_dot_v + grazing * (1 - n_dot_v) + jnp.zeros(outside.shape, motion.dtype)
         else:
-            limit, per_depth = position_threshold * _footprint(target.position), _PER_DEPTH
+            limit, per_depth = _footprint(target.position), _PER_DEPTH
+            limit = jnp.asarray(position_threshold, limit.dtype) * limit
         if target.depth is not None:
             limit = limit + jnp.where(jnp.isfinite(target.depth), per_depth * jnp.abs(target.depth), 0)
         farthest = jnp.zeros(outside.shape, target.position.dtype)

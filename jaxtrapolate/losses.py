@@ -208,6 +208,7 @@ def extranet_loss(
         "hole": hole_loss(prediction, target, mask),
         "shade": shading_loss(prediction, target, shade=shade, fraction=fraction),
     }
+    hole_weight, shade_weight = (jnp.asarray(a, parts["l1"].dtype) for a in (hole_weight, shade_weight))
     return parts["l1"] + hole_weight * parts["hole"] + shade_weight * parts["shade"], parts
 
 

@@ -14,9 +14,9 @@ _DOUBLE = (np.dtype(np.float64), np.dtype(np.complex128))
 
 
 def widest(*values: Any) -> np.dtype:
-    """float64 where one of some arrays or dtypes is and `jax_enable_x64` is set, else float32.
+    """float64 where one of some arrays is and `jax_enable_x64` is set, else float32.
 
     `jnp.promote_types` is not for this: under strict promotion it refuses to compare float16 with float32.
     """
-    double = any(np.dtype(getattr(value, "dtype", value)) in _DOUBLE for value in values)
+    double = any(value.dtype in _DOUBLE for value in values)
     return jax.dtypes.canonicalize_dtype(np.float64 if double else np.float32)

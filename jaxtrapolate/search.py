@@ -158,6 +158,8 @@ def advance(leads: Leads, start: Array | None, top, rows: int, iterations: int, 
     at = pixels if start is None else start
     if start is None and solver == "fixed_point" and iterations > 0:  # the flow at a pixel itself needs no search
         at, iterations = pixels - only_finite(rows_of(leads.passing, top, rows)), iterations - 1
+    if iterations == 0:  # an empty loop has no result under `jax_disable_jit`
+        return jax.lax.stop_gradient(at)
     # a loop: unrolled, each step would compute all before
     step = newton if solver == "newton" else fixed_point
     return jax.lax.stop_gradient(jax.lax.scan(step, at, None, length=iterations)[0])

@@ -205,16 +205,6 @@ def test_forward_and_reverse_derivatives_agree(name):
             np.testing.assert_allclose(mapped[0], one, rtol=1e-3, atol=1e-5)
 
 
-STRICT = sorted(set(OPERATIONS) - {"convert_motion", "camera_motion", "camera_flow", "guided_warp"})
-
-
-@pytest.mark.parametrize("name", STRICT)
-def test_no_implicit_promotion(strict, name):
-    """Under strict promotion of dtypes and ranks; traced only."""
-    function, *arrays = OPERATIONS[name]
-    jax.eval_shape(function, *(jnp.asarray(a) for a in arrays))
-
-
 OPTIONS = {
     "backward_warp": lambda v: jx.backward_warp(jnp.asarray(image), jnp.asarray(motion), outside=v),
     "demodulate": lambda v: radiance.demodulate(jnp.asarray(color), jx.GBuffer(albedo=jnp.asarray(other)), floor=v),
