@@ -79,7 +79,7 @@ def write_pictures(sequence: Sequence, window: Window, methods: dict[str, Method
     if window.target.motion is not None:
         holes = hole_masks(here, there, window.target.motion).any
         pictures["holes"] = put(
-            "holes", eight_bit(np.where(np.asarray(holes), np.float32([0.1, 0.9, 0.2]), truth * 0.5))
+            "holes", eight_bit(np.where(np.asarray(holes), np.array([0.1, 0.9, 0.2], np.float32), truth * 0.5))
         )
     for name, method in methods.items():
         image = np.asarray(display(method(*arguments(method, window)), hdr=sequence.hdr))
