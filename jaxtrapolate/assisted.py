@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image, check_present
 from jaxtrapolate.gather import Filter, all_finite, sample, weigh, where_finite
+from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Keyframe, record, replace
 from jaxtrapolate.search import Correspondence, check_scalar, positions, within
 from jaxtrapolate.strips import by_strips, once, rows_of
@@ -84,7 +85,7 @@ def blend(
     first: Float[Array, "h w c"], second: Float[Array, "h w c"], weight: Float[Array, "h w 1"]
 ) -> Float[Array, "h w c"]:
     """(1 - weight) first + weight second (eq. 13-15); at 0 and 1 one of them bit for bit, whatever the other is."""
-    wide = jnp.promote_types(first.dtype, weight.dtype)
+    wide = widest(first, weight)
     weight = weight.astype(wide)
     return (weigh(first.astype(wide), 1 - weight) + weigh(second.astype(wide), weight)).astype(first.dtype)
 
@@ -159,7 +160,7 @@ def _part(sources, top, rows: int, *, filter: Filter) -> Interpolation:
 
 @partial(jax.jit, static_argnames=("filter",))
 def _assisted(previous, next, target, alpha, epsilon, *, filter):
-    wide = jnp.promote_types(target.forward_flow.dtype, jnp.float32)
+    wide = widest(target.forward_flow)
     alpha, epsilon = (jnp.asarray(a).astype(wide) for a in (alpha, epsilon))
     frames = tuple((f.color, f.depth, (all_finite(f.color), all_finite(f.depth))) for f in (previous, next))
     sources = frames, (target.depth, target.backward_flow, target.forward_flow), alpha, epsilon

@@ -29,6 +29,7 @@ from jaxtrapolate.assisted import (
 )
 from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image, check_present
 from jaxtrapolate.gather import Filter, all_finite, inside, sample
+from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Keyframe, replace
 from jaxtrapolate.search import (
     Correspondence,
@@ -241,7 +242,7 @@ def _part(sources, top, rows: int, *, options: _Options) -> tuple[Interpolation,
 @partial(jax.jit, static_argnames=("options",))
 def _interpolate(previous, next, alpha, offsets, epsilon_error, epsilon_depth, epsilon_trip, *, options):
     flow, opposite = previous.forward_flow, next.backward_flow
-    wide = jnp.promote_types(jnp.promote_types(flow.dtype, opposite.dtype), jnp.float32)
+    wide = widest(flow, opposite)
     numbers = (alpha, epsilon_error, epsilon_depth, epsilon_trip)
     alpha, *epsilons = (jnp.asarray(a).astype(wide) for a in numbers)
 

@@ -117,7 +117,7 @@ def _cause_map(target, source, motion, hidden, metric) -> Int[Array, "h w"]:
         glossy = glossy if here.sky is None else glossy & (here.sky < 0.5)
     edge = jnp.where(metric, _or(edges(here, metric_depth=True), no), _or(edges(here, metric_depth=False), no))
     rest = ~no
-    return jnp.argmax(jnp.concatenate([border, hidden, shadow, glossy, edge, rest], -1), -1)
+    return jnp.argmax(jnp.concatenate([border, hidden, shadow, glossy, edge, rest], -1), -1).astype(jnp.int32)
 
 
 def _or(mask, otherwise):

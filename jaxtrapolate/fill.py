@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.checks import ArrayLike, Size, check_image
 from jaxtrapolate.gather import take_rows
+from jaxtrapolate.precision import widest
 
 
 def check_mask(name: str, value: Bool[ArrayLike, "h w"], *, size: Size) -> None:
@@ -68,7 +69,7 @@ def fill_pyramid(image: Float[ArrayLike, "h w c"], covered: Bool[ArrayLike, "h w
     size = check_image("image", image)
     check_mask("covered", covered, size=size)
     known = covered[..., None] & jnp.all(jnp.isfinite(image), -1, keepdims=True)
-    value = jnp.where(known, image, 0).astype(jnp.promote_types(image.dtype, jnp.float32))
+    value = jnp.where(known, image, 0).astype(widest(image))
     levels = [(value, known)]
     while max(value.shape[:2]) > 1:
         total = _halved(jnp.concatenate([value, known.astype(value.dtype)], -1))

@@ -17,6 +17,7 @@ from jaxtrapolate.assisted import DepthKind
 from jaxtrapolate.checks import Size, check_choice, check_image
 from jaxtrapolate.gather import sample, take_rows
 from jaxtrapolate.motion import camera_motion
+from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Camera, Keyframe, replace
 from jaxtrapolate.scatter import splat_source
 from jaxtrapolate.search import check_flow, positions, within
@@ -126,13 +127,14 @@ def _fill(flow, covered, depth):
     height, width, _ = flow.shape
     row, column = (jax.lax.broadcasted_iota(jnp.int32, covered.shape, k) for k in (0, 1))
     rows = flow.reshape(-1, flow.shape[-1])
-    best, apart, steps = jnp.zeros_like(flow), jnp.full(covered.shape, jnp.inf), jnp.full(covered.shape, height + width)
+    best, apart = jnp.zeros_like(flow), jnp.full(covered.shape, jnp.inf, jnp.float32)
+    steps = jnp.full(covered.shape, height + width, jnp.int32)
     for axis, reverse in ((1, False), (1, True), (0, False), (0, True)):
         found = _last(covered, axis=axis, reverse=reverse)
         there = jnp.maximum(found, 0)
         index = row * width + there if axis == 1 else there * width + column
         far = jnp.abs(found - (column if axis == 1 else row))
-        differs = jnp.zeros(covered.shape)
+        differs = jnp.zeros(covered.shape, jnp.float32)
         if depth is not None:
             differs = jnp.abs(take_rows(depth.reshape(-1, 1), index) - depth)[..., 0].astype(jnp.float32)
             differs = jnp.where(jnp.isnan(differs), jnp.float32(jnp.finfo(jnp.float32).max), differs)
@@ -147,8 +149,8 @@ def _turned(flow, own_depth, other_depth, metric):
 
     A point that lands where the other frame shows quite another depth is hidden there, and left out.
     """
-    if own_depth is None:
-        own_depth = jnp.zeros((*flow.shape[:2], 1), flow.dtype)
+    own_depth = jnp.zeros((*flow.shape[:2], 1), flow.dtype) if own_depth is None else own_depth.astype(flow.dtype)
+    other_depth = None if other_depth is None else other_depth.astype(flow.dtype)
     carried = own_depth + flow[..., 2:] if flow.shape[-1] == 3 else own_depth
     index, covered = splat_source(flow[..., :2], carried)
     rows = jnp.concatenate([-flow, carried], -1)
@@ -164,7 +166,8 @@ def _deepened(flow, depth, other_depth):
     """The flow with the change of depth found where it leads; 0 where that is outside, or of another surface."""
     finite = jnp.all(jnp.isfinite(flow), -1, keepdims=True)
     at = positions(flow.shape[0], flow.shape[1], flow.dtype) + jnp.where(finite, flow, 0)
-    change = sample(other_depth, at[..., 0], at[..., 1]).astype(flow.dtype) - depth.astype(flow.dtype)
+    depth = depth.astype(flow.dtype)
+    change = sample(other_depth, at[..., 0], at[..., 1]).astype(flow.dtype) - depth
     same = jnp.abs(change) <= _HIDDEN * jnp.abs(depth)
     used = finite & same & within(at, *depth.shape[:2])[..., None]
     return jnp.concatenate([flow, jnp.where(used, change, 0)], -1)
@@ -237,4 +240,4 @@ def complete_flows(previous: Keyframe, next: Keyframe, *, depth: DepthKind = "me
 
 
 def _wide(flow):
-    return flow.astype(jnp.promote_types(flow.dtype, jnp.float32))
+    return flow.astype(widest(flow))

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.gather import backward_warp
+from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Frame, GBuffer, check_frame, replace
 from jaxtrapolate.scatter import splat_nearest
 
@@ -35,6 +36,7 @@ def forecast(frame: Frame, fraction: float | Float[Array, ""]) -> Frame:
     """
     check_frame("frame", frame)
     back = check_present("frame.motion", frame.motion, needed_by="forecast")
+    fraction = jnp.asarray(fraction).astype(back.dtype)
     onward = -fraction * back
     depth = None if frame.gbuffer is None else frame.gbuffer.depth
     depth = jnp.zeros_like(back[..., :1]) if depth is None else depth
@@ -49,5 +51,5 @@ def forecast(frame: Frame, fraction: float | Float[Array, ""]) -> Frame:
                 for name, value in ((n, getattr(buffers, n)) for n in buffers.__dataclass_fields__)
             }
         )
-    time = None if frame.time is None else frame.time + fraction
+    time = None if frame.time is None else jnp.asarray(frame.time).astype(widest(back)) + fraction.astype(widest(back))
     return Frame(gbuffer=buffers, motion=motion, camera=frame.camera, time=time)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Inexact, Shaped
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image
+from jaxtrapolate.precision import widest
 
 Filter = Literal["nearest", "bilinear", "bicubic"]
 
@@ -33,7 +34,7 @@ def landing(motion: Float[Array, "h w 2"]) -> tuple[Float[Array, "h w"], Float[A
     The gradient is zero where the motion is not finite.
     """
     height, width, _ = motion.shape
-    motion = motion.astype(jnp.promote_types(motion.dtype, jnp.float32))
+    motion = motion.astype(widest(motion))
     finite = jnp.isfinite(motion[..., 0]) & jnp.isfinite(motion[..., 1])
     x, y = pixel_grid(height, width, motion.dtype)
     return x + jnp.where(finite, motion[..., 0], 0), y + jnp.where(finite, motion[..., 1], 0), finite
@@ -149,7 +150,7 @@ def _bilinear(product, image, x, y):
     column, t = cell(x, width)
     row, u = cell(y, height)
     t, u = t[..., None], u[..., None]
-    real = jnp.promote_types(jnp.finfo(image.dtype).dtype, x.dtype)
+    real = widest(image, x)
     wide = jnp.result_type(image.dtype) if jnp.iscomplexobj(image) else real
     right, down = int(width > 1), int(height > 1)
     taps = take_offsets(image, row, column, [(0, 0), (0, right), (down, 0), (down, right)])
@@ -178,7 +179,7 @@ def _bicubic(product, image, x, y):
     column, t = cell(x, width)
     row, u = cell(y, height)
     across, along = _catmull_rom(t, column, width), _catmull_rom(u, row, height)
-    wide = jnp.promote_types(image.dtype, x.dtype)
+    wide = widest(image, x)
     padded = jnp.pad(image, ((1, 2), (1, 2), (0, 0)), mode="edge")
     taps = take_offsets(padded, row, column, [(j, i) for j in range(4) for i in range(4)])
     total = jnp.zeros((), wide)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.checks import ArrayLike, check_image
 from jaxtrapolate.gather import landing, pixel_grid, sample, take_rows
+from jaxtrapolate.precision import widest
 from jaxtrapolate.scatter import splat_source
 
 _STEP = 0.1  # relative: a neighbour farther by more is another surface
@@ -194,7 +195,7 @@ def grid_warp(
         check_image("depth", depth, size=size, channels=1)
     if not isinstance(cell, int) or cell < 1:
         raise ValueError(f"cell: expected an integer of at least 1, got {cell!r}")
-    wide = jnp.promote_types(flow.dtype, jnp.float32)
+    wide = widest(flow)
     fraction = jnp.asarray(fraction).astype(wide)
     x, y = _axis(width, cell), _axis(height, cell)
     if depth is not None and snap:

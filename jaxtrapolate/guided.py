@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, UInt32
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image
 from jaxtrapolate.gather import backward_warp, landing, pixel_grid, take_rows, weigh
+from jaxtrapolate.precision import widest
 
 Guides = Literal["float32", "packed"]
 
@@ -67,13 +68,13 @@ def _select(x, y, target, padded, guide_factor, space_factor, *, shape, reach, t
     channels = target.shape[-1]
     column, row = _nearest(x, reach, width), _nearest(y, reach, height)
     base = (row + border - reach) * stride + column + border - reach
-    dx, dy = x - column, y - row
+    dx, dy = x - column.astype(x.dtype), y - row.astype(y.dtype)
     best = [jnp.full(x.shape, _NONE)] * keep
     for number, (j, i) in enumerate(taps):
         shift = (j + reach) * stride + i + reach
         there = padded[shift : shift + count]
         theirs = [take_rows(there[:, k : k + 1], base)[..., 0] for k in range(there.shape[-1])]
-        squared = jnp.zeros((), jnp.float32)
+        squared = jnp.zeros((), target.dtype)
         for k in range(channels):
             squared = squared + jnp.square(target[..., k] - theirs[k].astype(target.dtype))
         apart = jnp.square(dx - i) + jnp.square(dy - j)
@@ -110,17 +111,18 @@ def _blend(code, x, y, image, target, source, smaller, guide_factor, space_facto
         for k in range(source.shape[-1]):
             theirs = take_rows(rows[:, k : k + 1], index)[..., 0]
             squared = squared + jnp.square(jnp.where(used, target[..., k] - theirs, 0))
-        apart = jnp.where(used, jnp.square(x - tap_column) + jnp.square(y - tap_row), 0)  # may be infinite where unused
+        dx, dy = x - tap_column.astype(x.dtype), y - tap_row.astype(y.dtype)
+        apart = jnp.where(used, jnp.square(dx) + jnp.square(dy), 0)  # may be infinite where unused
         return jnp.where(used, guide_factor * squared + space_factor * apart, jnp.inf)
 
     slots = 6 * jnp.arange(keep, dtype=jnp.uint32)
     costs = jax.lax.map(rate, slots)
-    least = jax.lax.stop_gradient(jnp.min(costs, 0))
+    least = jax.lax.stop_gradient(jnp.min(costs, 0, keepdims=True))
     any_tap, used = least < jnp.inf, costs < jnp.inf
     # divided twice, because 2 m^2 itself may underflow
     over = jnp.where(used, costs - jnp.where(any_tap, least, 0), 0) / smaller / smaller * 0.5
     weights = jnp.where(used, jnp.exp(-over), 0)
-    weights = weights.at[0].set(jnp.where(any_tap, weights[0], 1))
+    weights = weights.at[0].set(jnp.where(any_tap[0], weights[0], 1))
     total = jnp.sum(weights, 0)
     colors = image.reshape(-1, channels)
     result = jnp.zeros((), weights.dtype)
@@ -164,7 +166,7 @@ def _bordered(guide, reach):
 @partial(jax.jit, static_argnames=("strides", "keep", "packed"))
 def _guided_warp(image, motion, target, source, sigma_guide, sigma_space, *, strides, keep, packed):
     height, width, _ = image.shape
-    wide = jnp.promote_types(motion.dtype, jnp.float32)
+    wide = widest(motion)
     target, source = target.astype(wide), source.astype(wide)
     smaller, *factors = _factors(jnp.asarray(sigma_guide, wide), jnp.asarray(sigma_space, wide))
     taps = guided_taps(strides)
@@ -313,5 +315,6 @@ def far_motion(
     short = [(0, max(0, size - have)) for size, have in zip((height, width), further.shape, strict=False)]
     further = jnp.pad(further, (*short, (0, 0)), mode="edge")[:height, :width].astype(motion.dtype)
     there = backward_warp(source_guide, motion, filter="nearest")
-    differ = jnp.sum(jnp.square(target_guide - there), -1, keepdims=True) > unlike
+    apart = jnp.sum(jnp.square(target_guide - there), -1, keepdims=True)
+    differ = apart > jnp.asarray(unlike, apart.dtype)
     return jnp.where(holes & differ, motion + further, motion)

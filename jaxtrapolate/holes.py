@@ -94,7 +94,7 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
         stencil = _soft(3 * difference - 1, softness) if soft else difference > 1 / 3
         static = warped == 0
     elif both["stencil"]:
-        other = jnp.zeros_like(target.stencil)
+        other = jnp.zeros(outside.shape, x.dtype)
         differs = jnp.zeros(outside.shape, bool)
         moving = jnp.zeros(outside.shape, bool)
         for ids, weight in _taps(source.stencil, x, y, taps):
@@ -118,19 +118,21 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
             lengths = here * there
             cosine = jnp.where(lengths > 0, cosine / jnp.sqrt(jnp.where(lengths > 0, lengths, 1)), 0)
             concerned &= seen
+        least = jnp.asarray(normal_threshold, cosine.dtype)
         if soft:
-            normal = jnp.where(concerned, _soft((normal_threshold - cosine) / (1 - normal_threshold), softness), 0)
+            normal = jnp.where(concerned, _soft((least - cosine) / (1 - least), softness), 0)
         else:
-            normal = concerned & (cosine < normal_threshold)
+            normal = concerned & (cosine < least)
 
     position = None
     if both["position"]:
         if absolute:
-            facing, grazing, per_depth = position_threshold
+            facing, grazing, per_depth = (jnp.asarray(a, target.position.dtype) for a in position_threshold)
             n_dot_v = 1.0 if target.n_dot_v is None else jnp.abs(target.n_dot_v)
             limit = facing * n_dot_v + grazing * (1 - n_dot_v) + jnp.zeros(outside.shape, motion.dtype)
         else:
-            limit, per_depth = position_threshold * _footprint(target.position), _PER_DEPTH
+            limit, per_depth = _footprint(target.position), _PER_DEPTH
+            limit = jnp.asarray(position_threshold, limit.dtype) * limit
         if target.depth is not None:
             limit = limit + jnp.where(jnp.isfinite(target.depth), per_depth * jnp.abs(target.depth), 0)
         farthest = jnp.zeros(outside.shape, target.position.dtype)

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_installed
+from jaxtrapolate.precision import widest
 from jaxtrapolate.weights.pickled import read_pickle
 
 Net = Literal["vgg", "alex"]
@@ -147,7 +148,7 @@ def features(
     precision: jax.lax.Precision | None = None,
 ) -> dict[str, Array]:
     """The layers `names` of a network, `[N, h, w, C]` each, not jitted and unchecked; see `vgg_features`."""
-    images = images.astype(jnp.promote_types(images.dtype, jnp.float32))
+    images = images.astype(widest(images))
     mean, deviation = (jnp.asarray(a, images.dtype)[None, None, None] for a in (_MEAN, _DEVIATION))
     values, found = (images - mean) / deviation, {}
     for layer, (kernel, bias) in zip(_NETS[net], weights.layers, strict=True):

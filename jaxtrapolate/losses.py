@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_array, check_choice, check_image
+from jaxtrapolate.precision import widest
 
 Shade = Literal["release", "paper"]
 
@@ -26,7 +27,7 @@ def _difference(prediction, target):
     """prediction - target, 0 where the target is not finite, and where it is finite."""
     size = check_image("prediction", prediction)
     check_image("target", target, size=size, channels=prediction.shape[-1])
-    wide = jnp.promote_types(jnp.promote_types(prediction.dtype, target.dtype), jnp.float32)
+    wide = widest(prediction, target)
     finite = jnp.isfinite(target)
     prediction, target = (jnp.where(finite, a, 0).astype(wide) for a in (prediction, target))
     return prediction - target, finite
@@ -207,6 +208,7 @@ def extranet_loss(
         "hole": hole_loss(prediction, target, mask),
         "shade": shading_loss(prediction, target, shade=shade, fraction=fraction),
     }
+    hole_weight, shade_weight = (jnp.asarray(a, parts["l1"].dtype) for a in (hole_weight, shade_weight))
     return parts["l1"] + hole_weight * parts["hole"] + shade_weight * parts["shade"], parts
 
 

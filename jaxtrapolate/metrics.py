@@ -16,9 +16,15 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate import perceptual
 from jaxtrapolate.checks import check_choice, check_image, check_installed
+from jaxtrapolate.precision import widest
 
 _SIGMA = 1.5
 _RADIUS = 5  # an 11 x 11 window
+
+
+def _counts(mask):
+    """Where a mask, bool or weights, is more than nothing."""
+    return mask if mask.dtype == bool else mask > 0
 
 
 def _mean(values, mask):
@@ -31,10 +37,10 @@ def _mean(values, mask):
 
 
 def _squared_error(first, second, mask):
-    wide = jnp.promote_types(jnp.promote_types(first.dtype, second.dtype), jnp.float32)
+    wide = widest(first, second)
     first, second = first.astype(wide), second.astype(wide)
     if mask is not None:  # before the square, so that what is left out has no part in the gradient either
-        first, second = jnp.where(mask > 0, first, 0), jnp.where(mask > 0, second, 0)
+        first, second = (jnp.where(_counts(mask), image, 0) for image in (first, second))
     return _mean(jnp.square(first - second), mask)
 
 
@@ -125,7 +131,7 @@ def ssim_map(
     height, width, _ = first.shape
     if height <= 2 * _RADIUS or width <= 2 * _RADIUS:
         raise ValueError(f"first: expected at least 11 x 11 pixels for SSIM's window, got {height} x {width}")
-    wide = jnp.promote_types(first.dtype, jnp.float32)
+    wide = widest(first)
     first, second = first.astype(wide), second.astype(wide)
     peak = jnp.asarray(peak, wide)
     c1, c2 = (0.01 * peak) ** 2, (0.03 * peak) ** 2
@@ -213,8 +219,9 @@ class Metric:
         if self.name in METRICS:
             return float(self.function(image, reference, mask=jnp.asarray(mask)))
         _check(image, reference, mask)
-        reference = jnp.where(jnp.asarray(mask) > 0, reference, jnp.where(jnp.isfinite(reference), reference, 0))
-        return float(self.function(jnp.where(jnp.asarray(mask) > 0, image, reference), reference))
+        counts = _counts(jnp.asarray(mask))
+        reference = jnp.where(counts, reference, jnp.where(jnp.isfinite(reference), reference, 0))
+        return float(self.function(jnp.where(counts, image, reference), reference))
 
 
 _ALL = {

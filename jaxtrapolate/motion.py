@@ -82,7 +82,7 @@ def convert_motion(motion: Float[Array, "h w 2"], *, sign: Sign, units: Units, y
     scale = {"pixels": (1.0, 1.0), "uv": (width, height), "ndc": (width / 2, height / 2)}[units]
     forward = -1.0 if sign == "current_minus_previous" else 1.0
     down = -1.0 if y_axis == "up" else 1.0
-    return motion * jnp.array([scale[0] * forward, scale[1] * forward * down], motion.dtype)
+    return motion * jnp.array([[[scale[0] * forward, scale[1] * forward * down]]], motion.dtype)
 
 
 def _project(camera: Camera, points: Array, height: int, width: int) -> tuple[Array, Array]:
@@ -92,8 +92,9 @@ def _project(camera: Camera, points: Array, height: int, width: int) -> tuple[Ar
     w = clip[..., 3:]
     ahead = w > 0
     ndc = clip[..., :2] / jnp.where(ahead, w, 1)
-    size = jnp.array([width, height], points.dtype)
-    return (ndc * jnp.array([0.5, -0.5], points.dtype) + 0.5) * size - 0.5, ahead
+    half, size = jnp.array([0.5, -0.5], ndc.dtype), jnp.array([width, height], ndc.dtype)
+    half, size = (jnp.broadcast_to(a, ndc.shape) for a in (half, size))
+    return (ndc * half + 0.5) * size - 0.5, ahead
 
 
 @jax.jit

@@ -26,6 +26,7 @@ from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_inst
 from jaxtrapolate.imagenet import LPIPS_LAYERS, Net, NetworkWeights, features
 from jaxtrapolate.imagenet import network_weights as network_weights
 from jaxtrapolate.imagenet import vgg_features as vgg_features
+from jaxtrapolate.precision import widest
 
 VmafModel = Literal["vmaf_v0.6.1", "vmaf_v0.6.1neg", "vmaf_4k_v0.6.1"]
 
@@ -122,7 +123,7 @@ def _normalized(features):
 
 @partial(jax.jit, static_argnames=("net",))
 def _lpips(weights, image, reference, net):
-    wide = jnp.promote_types(jnp.promote_types(image.dtype, reference.dtype), jnp.float32)
+    wide = widest(image, reference)
     names, highest = LPIPS_LAYERS[net], jax.lax.Precision.HIGHEST
     both = features(weights, jnp.stack([image.astype(wide), reference.astype(wide)]), names, net=net, precision=highest)
     total = jnp.zeros((), wide)

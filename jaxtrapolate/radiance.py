@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_choice, check_image, check_present
+from jaxtrapolate.precision import widest
 from jaxtrapolate.records import GBuffer, check_gbuffer
 
 By = Literal["albedo+specular", "albedo", "none"]
@@ -35,13 +36,14 @@ def demodulation_divisor(
     if by == "none":
         if size is None:
             raise ValueError("gbuffer: expected a buffer that tells the size, got none")
-        return jnp.ones((*size, 3))
+        return jnp.ones((*size, 3), widest(*jax.tree.leaves(gbuffer)))
     divisor = check_present("gbuffer.albedo", gbuffer.albedo, needed_by=f"by={by!r}")
     if by == "albedo+specular" and gbuffer.specular is not None:
         dielectric = 1.0 if gbuffer.metallic is None else 1 - gbuffer.metallic
         divisor = divisor + 0.08 * gbuffer.specular * dielectric
     # not jnp.maximum, which halves the gradient at a tie; NaN gives the floor
-    divisor = jnp.where(divisor > floor, divisor, jnp.asarray(floor, divisor.dtype))
+    floor = jnp.asarray(floor, divisor.dtype)
+    divisor = jnp.where(divisor > floor, divisor, floor)
     return divisor if gbuffer.sky is None else jnp.where(gbuffer.sky > 0.5, 1, divisor)
 
 

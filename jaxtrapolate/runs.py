@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.assisted import Offsets, check_keyframe
 from jaxtrapolate.bidirectional import interpolate_bidirectional, slim
 from jaxtrapolate.checks import ArrayLike
+from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Keyframe
 from jaxtrapolate.search import check_scalar
 
@@ -63,7 +64,7 @@ def _frames(previous, next, alphas, targets, lights, keep: Callable, total, thre
 def _wide(*frames: Keyframe):
     """The dtype of places between some frames."""
     flows = [flow for frame in frames for flow in (frame.forward_flow, frame.backward_flow) if flow is not None]
-    return jnp.result_type(*flows, jnp.float32)
+    return widest(*flows)
 
 
 @partial(jax.jit, static_argnames=("factor", "options"))
@@ -121,7 +122,7 @@ def _check_lights(lights: Any, number: int, options: Static) -> None:
 def _blur(before, after, shutter, targets, lights, thresholds, *, samples, options):
     shade = _lit(options, jax.tree.map(lambda a: a[samples], lights))
     sharp = after[0].color if shade is None else shade(after[0].color)
-    wide, parts = jnp.promote_types(sharp.dtype, jnp.float32), 2 * samples + 1
+    wide, parts = widest(sharp), 2 * samples + 1
 
     def add(total, color):
         return total + (color.astype(wide) - sharp.astype(wide)), None

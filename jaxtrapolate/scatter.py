@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_present
 from jaxtrapolate.gather import landing, take_rows, weigh
+from jaxtrapolate.precision import widest
 
 Mode = Literal["sum", "average", "linear", "softmax"]
 
@@ -115,7 +116,7 @@ def splat_nearest(
 @partial(jax.jit, static_argnames=("mode",))
 def _splat(values, motion, weights, *, mode):
     height, width, channels = values.shape
-    wide = jnp.promote_types(values.dtype, jnp.promote_types(motion.dtype, jnp.float32))
+    wide = widest(values, motion)
     x, y, finite = landing(motion.astype(wide))
     finite &= (jnp.abs(x) < 2.0**30) & (jnp.abs(y) < 2.0**30)
     x, y = jnp.where(finite, x, 0), jnp.where(finite, y, 0)

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image
 from jaxtrapolate.gather import all_finite, inside, pixel_grid, root, sample, where_finite
+from jaxtrapolate.precision import widest
 from jaxtrapolate.records import record
 from jaxtrapolate.strips import by_strips, rows_of
 
@@ -157,6 +158,8 @@ def advance(leads: Leads, start: Array | None, top, rows: int, iterations: int, 
     at = pixels if start is None else start
     if start is None and solver == "fixed_point" and iterations > 0:  # the flow at a pixel itself needs no search
         at, iterations = pixels - only_finite(rows_of(leads.passing, top, rows)), iterations - 1
+    if iterations == 0:  # an empty loop has no result under `jax_disable_jit`
+        return jax.lax.stop_gradient(at)
     # a loop: unrolled, each step would compute all before
     step = newton if solver == "newton" else fixed_point
     return jax.lax.stop_gradient(jax.lax.scan(step, at, None, length=iterations)[0])
@@ -224,7 +227,7 @@ def _search_part(sources, top, rows, *, iterations, solver, filter):
 @partial(jax.jit, static_argnames=("iterations", "solver", "filter"))
 def _search(flow, fraction, start, *, iterations, solver, filter):
     """`iterative_search` without its checks."""
-    wide = jnp.promote_types(flow.dtype, jnp.float32)
+    wide = widest(flow)
     flow, fraction = flow.astype(wide), jnp.asarray(fraction).astype(wide)
     if start is not None:
         pixels = positions(flow.shape[0], flow.shape[1], wide)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import ArrayLike, check_image
+from jaxtrapolate.precision import widest
 from jaxtrapolate.search import check_flow, check_scalar, only_finite, pair, plane, positions, scaled
 from jaxtrapolate.strips import by_strips, rows_of
 
@@ -32,7 +33,7 @@ def dual_start(flow: Float[ArrayLike, "h w c"], fraction: float | Float[ArrayLik
     """
     height, _ = check_flow("flow", flow)
     check_scalar("fraction", fraction)
-    wide = jnp.promote_types(flow.dtype, jnp.float32)
+    wide = widest(flow)
     return pair(dual(flow.astype(wide), jnp.asarray(fraction).astype(wide), 0, height))
 
 
@@ -117,7 +118,7 @@ def latest_start(
     if not isinstance(reach, int) or reach < 0:
         raise ValueError(f"reach: expected an integer of at least 0, got {reach!r}")
     check_scalar("ratio", ratio)
-    wide = jnp.promote_types(offset.dtype, jnp.float32)
+    wide = widest(offset)
     if depth is not None:
         check_image("depth", depth, size=(height, width), channels=1)
     sources = LatestOffsets(jnp.asarray(offset).astype(wide), depth, jnp.asarray(ratio).astype(wide))

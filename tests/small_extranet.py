@@ -46,9 +46,9 @@ def make_window(size=SIZE, *, rendered=3, seed=0, sky=True):
     return tuple(history), target
 
 
-def random_model(config):
+def random_model(config, build=ExtraNet):
     """A network with random weights; made from shapes alone, because an initialisation compiles layer by layer."""
-    structure, state = nnx.split(nnx.eval_shape(lambda: ExtraNet(config, rngs=nnx.Rngs(0))))
+    structure, state = nnx.split(nnx.eval_shape(lambda: build(config, rngs=nnx.Rngs(0))))
     rng = np.random.default_rng(3)
 
     def values(path, leaf):

@@ -36,7 +36,7 @@ class Net(nnx.Module):
     """Batch norm and a linear map, with a count and random keys besides."""
 
     def __init__(self, options, rngs):
-        self.wobble, self.calls, self.deterministic = options.wobble, Count(jnp.zeros(())), False
+        self.wobble, self.calls, self.deterministic = options.wobble, Count(jnp.zeros((), jnp.float32)), False
         self.dropout = nnx.Dropout(0.0, rngs=rngs)
         self.norm = nnx.data(nnx.BatchNorm(3, momentum=0.9, rngs=rngs) if options.norm else None)
         self.map = nnx.Linear(3, 2, rngs=rngs)

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxtrapolate.checks import check_present
@@ -79,7 +78,9 @@ def write_pictures(sequence: Sequence, window: Window, methods: dict[str, Method
         pictures["causes"] = put("causes", colorize_causes(causes))
     if window.target.motion is not None:
         holes = hole_masks(here, there, window.target.motion).any
-        pictures["holes"] = put("holes", eight_bit(jnp.where(holes, jnp.array([0.1, 0.9, 0.2]), truth * 0.5)))
+        pictures["holes"] = put(
+            "holes", eight_bit(np.where(np.asarray(holes), np.array([0.1, 0.9, 0.2], np.float32), truth * 0.5))
+        )
     for name, method in methods.items():
         image = np.asarray(display(method(*arguments(method, window)), hdr=sequence.hdr))
         error = np.abs(image - truth).mean(-1)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.flows import complete_flows
 from jaxtrapolate.methods.method import Frames, Stage, Values, rendered, upcoming
 from jaxtrapolate.methods.stages import chain
+from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Frame, Keyframe
 
 
@@ -18,16 +19,16 @@ def time_fraction(history: Frames, target: Frame, future: Frames) -> Float[Array
     """The target's time as a fraction of that between the rendered frames around it, 0 at the earlier one.
 
     Where one of the three frames has no time, or both of those around the same, by their places in the sequence: 1/2
-    between two neighbours.
+    between two neighbours. In the precision of the images, at least float32, whatever that of the times.
     """
     newest, following = rendered(history)[0], upcoming(future)[0]
-    counted = jnp.asarray((len(history) - newest) / (len(history) - newest + following + 1))
+    wide = widest(history[newest].color)
+    counted = jnp.asarray((len(history) - newest) / (len(history) - newest + following + 1), wide)
     times = history[newest].time, target.time, future[following].time
     if any(time is None for time in times):
         return counted
-    before, at, after = (jnp.asarray(time) for time in times)
-    span = after - before
-    return jnp.where(span != 0, (at - before) / jnp.where(span != 0, span, 1), counted)
+    to, whole = (jnp.asarray(times[k] - times[0]).astype(wide) for k in (1, 2))  # type: ignore[operator]
+    return jnp.where(whole != 0, to / jnp.where(whole != 0, whole, 1), counted)
 
 
 def _pair(state, values: Values):

@@ -20,6 +20,7 @@ from jaxtrapolate.methods.method import Method, Stage, Values, rendered, upcomin
 from jaxtrapolate.methods.stages import SKY, chain, find_holes
 from jaxtrapolate.methods.warping import fetch_guided
 from jaxtrapolate.motion import camera_motion
+from jaxtrapolate.precision import widest
 from jaxtrapolate.radiance import By, compress, demodulate, expand, modulate
 from jaxtrapolate.records import Frame, Keyframe, replace
 
@@ -59,8 +60,12 @@ def mix(first: Array, second: Array, weight: Array) -> Array:
     """Both images blended after `compress`: where they differ by much, in linear light the brighter one wins.
 
     On a path-traced map that gives 0.3-0.6 dB, under lamps that flicker 1-2 dB. Where both are the same it is exact.
+    Of the dtype of the first, blended in at least float32.
     """
-    mixed = expand(compress(first) * (1 - weight) + compress(second) * weight)
+    wide = widest(first, second, weight)
+    weight = weight.astype(wide)
+    mixed = compress(first.astype(wide)) * (1 - weight) + compress(second.astype(wide)) * weight
+    mixed = expand(mixed).astype(first.dtype)
     mixed = jnp.where(weight == 0, first, jnp.where(weight == 1, second, mixed))
     return jnp.where(first == second, first, mixed)
 
@@ -81,7 +86,7 @@ def _reproject(state, values: Values):
     if target.camera is not None and next.camera is not None and g.position is not None and g.stencil is not None:
         exact = camera_motion(g.position, target.camera, next.camera)
         still = (g.stencil < 0.5) & jnp.all(jnp.isfinite(exact), -1, keepdims=True)
-        to_next, known = jnp.where(still, exact, to_next), known | still[..., 0]
+        to_next, known = jnp.where(still, exact.astype(to_next.dtype), to_next), known | still[..., 0]
     seen_next = known[..., None] & ~find_holes(g, next.gbuffer, to_next)
     previous = values["previous"]
     seen_previous = ~find_holes(g, previous.gbuffer, to_previous)

@@ -42,7 +42,8 @@ def half_motion() -> Method:
     """
 
     def function(state, values: Values):
-        return {"image": backward_warp(values["previous"].color, values["alpha"] * values["between"])}
+        between = values["between"]
+        return {"image": backward_warp(values["previous"].color, values["alpha"].astype(between.dtype) * between)}
 
     return Method("half_motion", (PAIR, BETWEEN, Stage("fetch", function)), kind="interpolation", future=1)
 
@@ -50,7 +51,7 @@ def half_motion() -> Method:
 def _nearness(depth: Array) -> Float[Array, "h w 1"]:
     """Exponents by depth of any unit: -100 depth / (depth + its mean over the frame); NaN counts as farthest."""
     finite = jnp.isfinite(depth)
-    mean = jnp.sum(jnp.where(finite, jnp.abs(depth), 0)) / jnp.maximum(jnp.sum(finite), 1)
+    mean = jnp.sum(jnp.where(finite, jnp.abs(depth), 0)) / jnp.maximum(jnp.sum(finite, dtype=depth.dtype), 1)
     scale = jnp.where(mean > 0, mean, 1).astype(depth.dtype)
     held = jnp.where(finite, depth, 0)
     squashed = held / (jnp.abs(held) + scale)
@@ -93,12 +94,12 @@ def softmax_splat() -> Method:
             ("previous", "forward", alpha, values["exponents"][0]),
             ("next", "backward", 1 - alpha, values["exponents"][1]),
         ):
-            color, motion = values[name].color, passed * values[flow]
+            color, motion = values[name].color, passed.astype(values[flow].dtype) * values[flow]
             warped = splat(color, motion, weights=weights.astype(color.dtype), mode="softmax")
             landed = splat(jnp.ones_like(color[..., :1]), motion, mode="sum")
             sides.append((warped, jnp.minimum(landed, 1)))
         (first, in_first), (second, in_second) = sides
-        before, after = (1 - alpha) * in_first, alpha * in_second
+        before, after = (1 - alpha) * in_first.astype(alpha.dtype), alpha * in_second.astype(alpha.dtype)
         covered = before + after > 0
         weight = jnp.where(covered, after / jnp.where(covered, before + after, 1), evenly(alpha, first))
         return {"mixed": mix(first, second, weight), "covered": covered[..., 0]}

@@ -35,6 +35,7 @@ from jaxtrapolate.methods.warping import guided_stage
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig, extranet_from_torch
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.networks.stored import load_network
+from jaxtrapolate.precision import widest
 from jaxtrapolate.radiance import By, demodulate, log_decode, log_encode
 from jaxtrapolate.records import GBuffer
 from jaxtrapolate.weights import configured, read_torch
@@ -143,7 +144,7 @@ def features(buffers: GBuffer | None, like: Float[Array, "h w c"], preparation: 
 
 def encode(image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
     """log(1 + r) in at least float32; what is negative or not finite counts as 0."""
-    image = image.astype(jnp.promote_types(image.dtype, jnp.float32))
+    image = image.astype(widest(image))
     return log_encode(jnp.where(jnp.isfinite(image), image, 0))
 
 
@@ -226,13 +227,14 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
             colors = [history[i].color for i in rendered(history)][: len(motions)]
             same = [jnp.all(color == colors[0]) for color in colors[1:]]
             still = jnp.all(jnp.stack(same + [jnp.all(motion == 0) for motion in motions]))
-            image = jnp.where(still, values["histories"][0], image)
+            image = jnp.where(still, values["histories"][0].astype(image.dtype), image)
         return {"warped": image, "image": image, "guess": values["warped"]}
 
     def sky(state, values: Values):
+        image = values["image"]
         # the guided warp finds like sky where the occluder has moved on; the sky is not divided by anything
         plain = values["guess"] if guided and preparation.sky else composite(values, values["newest"].color)
-        return {"image": jnp.where(values["target"].gbuffer.sky > 0.5, plain, values["image"])}
+        return {"image": jnp.where(values["target"].gbuffer.sky > 0.5, plain.astype(image.dtype), image)}
 
     demodulation: dict[str, Any] = {"floor": preparation.floor, "sky": preparation.sky}
     past = max(1, config.histories)

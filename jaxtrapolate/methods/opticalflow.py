@@ -59,7 +59,8 @@ def dis() -> Method:
         return {"forward": jnp.asarray(dis_flow(first, second)), "backward": jnp.asarray(dis_flow(second, first))}
 
     def function(state, values: Values):
-        alpha, forward, backward = values["alpha"], values["forward"], values["backward"]
+        forward, backward = values["forward"], values["backward"]
+        alpha = values["alpha"].astype(forward.dtype)
         rest = 1 - alpha
         first = backward_warp(values["previous"].color, alpha * (alpha * backward - rest * forward))
         second = backward_warp(values["next"].color, rest * (rest * forward - alpha * backward))

@@ -15,6 +15,7 @@ from jaxtrapolate.gather import backward_warp, in_frame
 from jaxtrapolate.methods.between import depth_of
 from jaxtrapolate.methods.method import Frames, Method, Stage, Values, rendered
 from jaxtrapolate.methods.stages import REPROJECT, SKY
+from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Frame
 from jaxtrapolate.scatter import splat_nearest
 
@@ -76,16 +77,17 @@ def steps_onward(history: Frames, target: Frame) -> Float[Array, ""]:
     """How often the newest rendered frame's motion to the frame before it goes into the time until the target.
 
     By the frames' times; a frame that is not handed over was one frame earlier. Without times, by the number of frames.
+    In the precision of the images, at least float32.
     """
     newest = rendered(history)[0]
-    counted = jnp.asarray(float(len(history) - newest))
+    wide = widest(history[newest].color)
+    counted = jnp.asarray(len(history) - newest, wide)
     now, at = history[newest].time, target.time
     if now is None or at is None:
         return counted
-    now, at = jnp.asarray(now), jnp.asarray(at)
     before = history[newest - 1].time if newest > 0 else None
-    span = jnp.ones_like(now) if before is None else now - jnp.asarray(before)
-    return jnp.where(span != 0, (at - now) / jnp.where(span != 0, span, 1), counted)
+    span = jnp.ones((), wide) if before is None else jnp.asarray(now - before).astype(wide)
+    return jnp.where(span != 0, jnp.asarray(at - now).astype(wide) / jnp.where(span != 0, span, 1), counted)
 
 
 def _newest(state, values: Values):
@@ -98,7 +100,8 @@ NEWEST = Stage("newest", _newest, reads=("history.color",))
 
 
 def _linear(state, values: Values):
-    return {"onward": -values["steps"] * values["newest"].motion}
+    motion = values["newest"].motion
+    return {"onward": -values["steps"].astype(motion.dtype) * motion}
 
 
 LINEAR = Stage("linear motion", _linear, reads=("history.motion",), optional=True)

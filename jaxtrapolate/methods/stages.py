@@ -108,8 +108,8 @@ def modulate_stage(by: By = "albedo+specular", *, floor: float = 1e-2, sky: bool
 
 
 def _sky(state, values: Values):
-    buffers = values["target"].gbuffer
-    return {"image": jnp.where(buffers.sky > 0.5, buffers.sky_color, values["image"])}
+    buffers, image = values["target"].gbuffer, values["image"]
+    return {"image": jnp.where(buffers.sky > 0.5, jnp.asarray(buffers.sky_color, image.dtype), image)}
 
 
 SKY = Stage("sky", _sky, reads=("target.sky", "target.sky_color"), optional=True)

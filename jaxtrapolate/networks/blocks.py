@@ -15,6 +15,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_choice
+from jaxtrapolate.precision import widest
 
 Gate = Literal["none", "light", "full"]
 Activation = Literal["none", "relu", "prelu"]
@@ -76,7 +77,7 @@ def _convolved(x: Array, *convolutions: nnx.Conv) -> list[Array]:
     )
     around = kernel.shape[0] // 2
     strides, layout = cast(tuple[int, int], convolutions[0].strides), ("NHWC", "HWIO", "NHWC")
-    wide = jnp.promote_types(x.dtype, jnp.float32)  # of the sums: half precision is rounded once, after the bias
+    wide = widest(x)  # of the sums: half precision is rounded once, after the bias
     y = jax.lax.conv_general_dilated(
         x, kernel, strides, [(around, around)] * 2, dimension_numbers=layout, preferred_element_type=wide
     )
@@ -134,7 +135,7 @@ class Layer(nnx.Module):
         if norm:
             self.norm = nnx.BatchNorm(outputs, momentum=0.9, epsilon=1e-5, use_fast_variance=False, rngs=rngs)
         if activation == "prelu":
-            self.slope = nnx.Param(jnp.full((outputs,), 0.25))
+            self.slope = nnx.Param(jnp.full((outputs,), 0.25, jnp.float32))
 
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b i j d"]:
         x = x.astype(self.feature.kernel.dtype)

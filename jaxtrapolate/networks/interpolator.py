@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.checks import check_array
 from jaxtrapolate.gather import landing, sample
 from jaxtrapolate.networks.blocks import HE, Layer, double, pad_to_multiple, shuffle
+from jaxtrapolate.precision import widest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,7 +114,7 @@ class Interpolator(nnx.Module):
         batch, height, width, _ = check_array("first", first, shape=("B", "H", "W", 3))
         check_array("second", second, shape=(batch, height, width, 3))
         check_array("time", time, shape=(batch,))
-        wide = jnp.promote_types(first.dtype, jnp.float32)
+        wide = widest(first)
         later = time.astype(wide)[:, None, None, None]
         earlier = 1 - later
         frames = jnp.concatenate([first, second]).astype(wide)

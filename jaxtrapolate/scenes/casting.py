@@ -83,7 +83,7 @@ def place(scene: Scene, time: Float[Array, ""], hidden: Bool[Array, " b"] | None
     poses = scene.bodies.at(time)
     body = np.asarray(scene.body)
     world = Pose(poses.rotation[body], poses.translation[body]).compose(Pose(scene.rotation, scene.centre))
-    active = jnp.ones(len(body)) if hidden is None else 1.0 - hidden[body].astype(jnp.float32)
+    active = jnp.ones(len(body), jnp.float32) if hidden is None else 1.0 - hidden[body].astype(jnp.float32)
     return Placed(world.rotation, world.translation, scene.size, active, poses, scene.field, counts=scene.counts)
 
 
@@ -131,7 +131,7 @@ def first_hit(placed: Placed, o: Vector, d: Vector, own: Array | int = -1) -> Hi
     nearest = _fold(placed, step, jnp.full(shape, nothing))
     number = placed.number
     if placed.field is not None:
-        t_field = enter_field(placed.field, o, d) + jnp.zeros(shape)
+        t_field = enter_field(placed.field, o, d) + jnp.zeros(shape, jnp.float32)
         nearest = jnp.minimum(nearest, jnp.where(own != number, pack(t_field, number), nothing))
     found = nearest < jnp.int32(0x7F800000)
     primitive = jnp.where(found, nearest & 127, 0)
@@ -147,7 +147,7 @@ def first_hit(placed: Placed, o: Vector, d: Vector, own: Array | int = -1) -> Hi
     )
     local, direction, size = _into(row, o, d)
     kinds = jnp.asarray(placed.kinds()).at[primitive].get(mode="promise_in_bounds")
-    t = jnp.zeros(shape)
+    t = jnp.zeros(shape, jnp.float32)
     for index, (kind, pair) in enumerate(zip(KINDS, placed.counts, strict=True)):
         if sum(pair):
             t = jnp.where(kinds == index, ENTER[kind](local, direction, size), t)

@@ -116,7 +116,7 @@ def field_gap(field: HeightField, o: Vector, d: Vector, softness: Array) -> Arra
     span = jnp.clip((top - o.z) / rise, 0.0, 60.0 / d.length())
 
     def look(step: Array | int, smallest: Array) -> Array:
-        t = span * ((step + 1.0) / SHADOW_STEPS) ** 2
+        t = span * ((jnp.asarray(step, span.dtype) + 1) / SHADOW_STEPS) ** 2
         gap = o.z + t * d.z - field.height(o.x + t * d.x, o.y + t * d.y)
         return jnp.minimum(smallest, gap / jnp.maximum(t * softness, 1e-6))
 

@@ -253,7 +253,7 @@ def _traced(
         at = jnp.where(first + jnp.arange(pack, dtype=jnp.int32) < count, taken, total)
         return jax.tree.map(lambda leaf, value: leaf.at[at].set(value, mode="drop"), colors, found)
 
-    zero = vector(jnp.zeros(total))
+    zero = vector(jnp.zeros(total, jnp.float32))
     return jax.lax.fori_loop(0, -(-count // pack), one, zero).map(lambda leaf: leaf.reshape(shape))
 
 
@@ -326,7 +326,7 @@ def _render(
             d, hit = _primary(scene, placed, view, x + offset[0], y + offset[1])
             return total + _color(scene, placed, time, view, d, hit, 1.0 / samples**0.5, shadowed)[0], None
 
-        total, _ = jax.lax.scan(add, vector(jnp.zeros(size)), jnp.asarray(_offsets(samples)))
+        total, _ = jax.lax.scan(add, vector(jnp.zeros(size, jnp.float32)), jnp.asarray(_offsets(samples)))
         color = total * (1.0 / samples)
     poses = (placed.poses, placed_before.poses)
 

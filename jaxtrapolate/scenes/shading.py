@@ -76,8 +76,9 @@ def _geometry(placed: Placed, hit: Hit, position: Vector, d: Vector) -> tuple[Ve
     number, kinds = placed.number, placed.kinds()
     rotation, centre, size = placed.rotation, placed.centre, placed.size
     if placed.field is not None:
-        rotation = jnp.concatenate([rotation, jnp.eye(3)[None]])
-        centre, size = jnp.concatenate([centre, jnp.zeros((1, 3))]), jnp.concatenate([size, jnp.ones((1, 3))])
+        rotation = jnp.concatenate([rotation, jnp.eye(3, dtype=rotation.dtype)[None]])
+        centre = jnp.concatenate([centre, jnp.zeros((1, 3), centre.dtype)])
+        size = jnp.concatenate([size, jnp.ones((1, 3), size.dtype)])
     pick, pick3 = _picker(hit.primitive)
     to_world = tuple(tuple(pick(rotation[:, row, column]) for column in range(3)) for row in range(3))
     local = stage(lambda position, d: (rotate_back(to_world, position - pick3(centre)), rotate_back(to_world, d)))
@@ -168,7 +169,7 @@ def lamp_levels(lights: Lights, time: Array) -> Array:
     h = (h ^ (h >> 15)) * jnp.uint32(0x85EBCA77)
     h = (h ^ (h >> 13)) * jnp.uint32(0xC2B2AE3D)
     random = ((h ^ (h >> 16)) >> 8).astype(jnp.float32) / 2**24
-    return 1 - lights.lamp_flicker * (random >= lights.lamp_duty)
+    return jnp.where(random >= lights.lamp_duty, 1 - lights.lamp_flicker, 1)
 
 
 def sky_radiance(sky: Sky, lights: Lights, d: Vector, cloud: Array, *, sun: bool) -> Vector:
@@ -258,7 +259,7 @@ def direct_light(
 
     if scene.sun:
         sun = Vector(*(lights.sun_direction[k] for k in range(3)))  # scalars: turned once for each primitive
-        add(sun, lights.sun_color, jnp.ones(()), near=False, softness=lights.sun_radius)
+        add(sun, lights.sun_color, jnp.ones((), jnp.float32), near=False, softness=lights.sun_radius)
     if lights.lamp_radius.shape[0]:
         where, levels = lights.lamp_path.at(time), lamp_levels(lights, time)
         for k in range(where.shape[0]):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxtrapolate.gather import landing
 from jaxtrapolate.records import Frame
 from jaxtrapolate.scenes.render import flow, render, visible
 from jaxtrapolate.scenes.scene import Scene
@@ -50,8 +51,7 @@ def statistics(
 @jax.jit
 def _measure(now: Frame, before: Frame, motion: Float[Array, "h w 3"], seen: Array) -> Array:
     height, width = seen.shape
-    x = jnp.arange(width) + motion[..., 0]
-    y = jnp.arange(height)[:, None] + motion[..., 1]
+    x, y, _ = landing(motion[..., :2])
     inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
     column = jnp.clip(jnp.round(x), 0, width - 1).astype(jnp.int32)
     row = jnp.clip(jnp.round(y), 0, height - 1).astype(jnp.int32)

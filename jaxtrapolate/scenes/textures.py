@@ -89,8 +89,9 @@ def noise(p: Vector, frequency: Array, width: Array) -> Array:
     """Three octaves of noise in about -1..1 at `p`; octaves whose wavelength is below two footprints are left out."""
 
     def add(octave: Array, total: Array) -> Array:
-        scale = jnp.exp2(octave.astype(jnp.float32))
+        number = jnp.asarray(octave, p.x.dtype)
+        scale = jnp.exp2(number)
         fade = jnp.clip(1.5 - 2 * width * frequency * scale, 0.0, 1.0)
-        return total + fade / scale * _value_noise(p * (frequency * scale) + 17.3 * octave)
+        return total + fade / scale * _value_noise(p * (frequency * scale) + 17.3 * number)
 
     return jax.lax.fori_loop(0, OCTAVES, add, jnp.zeros_like(p.x))

@@ -47,29 +47,31 @@ def view_at(path: CameraPath, time: Float[Array, ""], size: tuple[int, int]) -> 
     eye, target = path.eye.at(time), path.target.at(time)
     back = eye - target
     back = back / jnp.linalg.norm(back)
-    right = jnp.cross(jnp.array([0.0, 0.0, 1.0]), back)
+    right = jnp.cross(jnp.array([0.0, 0.0, 1.0], back.dtype), back)
     right = right / jnp.linalg.norm(right)
     up = jnp.cross(back, right)
     c, s = jnp.cos(path.roll), jnp.sin(path.roll)
     rotation = jnp.stack([c * right + s * up, c * up - s * right, back])
     focal = 0.5 * size[0] / path.tangent
-    middle = jnp.array([0.5 * (size[1] - 1), 0.5 * (size[0] - 1)])
+    middle = jnp.array([0.5 * (size[1] - 1), 0.5 * (size[0] - 1)], eye.dtype)
     return View(eye, rotation, jnp.stack([focal, focal]), middle)
 
 
 def matrices(view: View, size: tuple[int, int]) -> Camera:
     """The view as a `Camera`."""
     translation = -matmul(view.rotation, view.eye[:, None])
-    world_to_camera = jnp.concatenate([jnp.concatenate([view.rotation, translation], axis=1), jnp.eye(4)[3:]])
-    zero = jnp.zeros(())
+    world_to_camera = jnp.concatenate(
+        [jnp.concatenate([view.rotation, translation], axis=1), jnp.eye(4, dtype=translation.dtype)[3:]]
+    )
+    zero = jnp.zeros((), view.scale.dtype)
     x, y = 2 * view.scale[0] / size[1], 2 * view.scale[1] / size[0]
     a, b = -(FAR + NEAR) / (FAR - NEAR), -2 * FAR * NEAR / (FAR - NEAR)
     projection = jnp.stack(
         [
             jnp.stack([x, zero, zero, zero]),
             jnp.stack([zero, y, zero, zero]),
-            jnp.array([0.0, 0.0, a, b]),
-            jnp.array([0.0, 0.0, -1.0, 0.0]),
+            jnp.array([0.0, 0.0, a, b], zero.dtype),
+            jnp.array([0.0, 0.0, -1.0, 0.0], zero.dtype),
         ]
     )
     return Camera(view=world_to_camera, projection=projection)

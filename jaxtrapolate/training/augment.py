@@ -42,8 +42,8 @@ def flip(tree: T, *, horizontal: Flag, vertical: Flag) -> T:
 
 
 def _flip(frame: Frame, horizontal: Flag, vertical: Flag) -> Frame:
-    x, y = (jnp.where(flag, -1.0, 1.0) for flag in (horizontal, vertical))
-    one = jnp.ones(())
+    one = jnp.ones((), jnp.float32)
+    x, y = (jnp.where(flag, -one, one) for flag in (horizontal, vertical))
 
     def image(value: Any) -> Array:
         value = jnp.asarray(value)
@@ -51,7 +51,7 @@ def _flip(frame: Frame, horizontal: Flag, vertical: Flag) -> Frame:
         return jnp.where(vertical, value[::-1], value)
 
     def signed(value: Any, *signs: Array) -> Array:
-        return value * jnp.stack(signs).astype(value.dtype)
+        return value * jnp.stack(signs).astype(value.dtype).reshape((1,) * (value.ndim - 1) + (-1,))
 
     fields: dict[str, Any] = {}
     for name in ("color", "motion"):
@@ -71,8 +71,8 @@ def _flip(frame: Frame, horizontal: Flag, vertical: Flag) -> Frame:
         screen, world = jnp.stack([x, y, one, one]), jnp.stack([x, one, y, one])
         view, projection = frame.camera.view, frame.camera.projection
         fields["camera"] = Camera(
-            view=None if view is None else view * screen[:, None] * world,
-            projection=None if projection is None else projection * screen[:, None] * screen,
+            view=None if view is None else view * screen[:, None] * world[None],
+            projection=None if projection is None else projection * screen[:, None] * screen[None],
         )
     return replace(frame, **fields)
 
@@ -98,18 +98,19 @@ def crop(tree: T, key: PRNGKeyArray, *, size: Size, weight: Float[Array, "h w 1"
     (whole,) = shapes
     if whole[0] < size[0] or whole[1] < size[1]:
         raise ValueError(f"size: expected at most the images' {list(whole)}, got {list(size)}")
-    room = jnp.array([whole[0] - size[0] + 1, whole[1] - size[1] + 1])
+    room = jnp.array([whole[0] - size[0] + 1, whole[1] - size[1] + 1], jnp.int32)
     if weight is None:
-        top, left = jax.random.randint(key, (2,), 0, room)
+        top, left = jax.random.randint(key, (2,), 0, room, jnp.int32)
     else:
         choice, shift = jax.random.split(key)
         total = jnp.cumsum(jnp.where(jnp.isfinite(weight), weight, 0).reshape(-1) + _LEAST)
         chosen = jnp.searchsorted(total, total[-1] * jax.random.uniform(choice, (), total.dtype))
-        place = jnp.array(jnp.unravel_index(chosen, whole)) - jax.random.randint(shift, (2,), 0, jnp.array(size))
+        before = jax.random.randint(shift, (2,), 0, jnp.array(size, jnp.int32), jnp.int32)
+        place = jnp.array(jnp.unravel_index(chosen, whole), jnp.int32) - before
         top, left = jnp.clip(place, 0, room - 1)
 
     def cut(image: Array) -> Array:
-        zeros = (0,) * (image.ndim - 2)
+        zeros = (jnp.int32(0),) * (image.ndim - 2)
         return jax.lax.dynamic_slice(image, (top, left, *zeros), (*size, *image.shape[2:]))
 
     return jax.tree.map(cut, tree)

@@ -88,7 +88,7 @@ class InterpolatorTask:
         """A random crop, as likely backward in time as forward."""
         place, order = jax.random.split(key)
         item = crop(example, place, size=self.options.crop)
-        backward = jax.random.bernoulli(order)
+        backward = jax.random.bernoulli(order, jnp.float32(0.5))
         first, second = item["first"], item["second"]
         turned = {"first": jnp.where(backward, second, first), "second": jnp.where(backward, first, second)}
         return item | turned

@@ -82,7 +82,8 @@ def _cast(tree: Any, precision: str) -> Any:
 
 def _averaged(decay: float, count: Array, old: Any, new: Any) -> Any:
     """The running average after `count` steps; at first it forgets faster, so that it does not stay at the start."""
-    keep = jnp.minimum(decay, (1.0 + count) / (10.0 + count))
+    count = count.astype(jnp.float32)
+    keep = jnp.minimum(decay, (1 + count) / (10 + count))
     return jax.tree.map(lambda o, n: (o * keep + n * (1 - keep)).astype(o.dtype), old, new)
 
 
@@ -129,7 +130,7 @@ def make_step(task: Task, config: Config) -> Step:
         def one(part: Example, key: Any) -> Batch:
             choice, own = jax.random.split(key)
             (count,) = {a.shape[0] for a in jax.tree.leaves(part)}
-            index = jax.random.randint(choice, (), 0, count)
+            index = jax.random.randint(choice, (), 0, count, jnp.int32)
             return task.sample(jax.tree.map(lambda a: a[index], part), own)
 
         return jax.vmap(one)(parts, keys)
@@ -150,12 +151,14 @@ def make_step(task: Task, config: Config) -> Step:
             return loss.astype(jnp.float32), (statistics, rest, dict(metrics))
 
         (loss, (statistics, rest, metrics)), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.weights)
-        updates, moments = optimizer.update(gradient, state.moments, state.weights)
-        weights = optax.apply_updates(state.weights, updates)
+        with jax.numpy_dtype_promotion("standard"):  # which Optax counts on: it raises floats to counts of steps
+            updates, moments = optimizer.update(gradient, state.moments, state.weights)
+            weights = optax.apply_updates(state.weights, updates)
+            used = {"gradient": optax.tree.norm(gradient), "learning_rate": rate(state.step)}
         average = state.average
         if config.average is not None:
             average = _averaged(config.average, state.step, average, (weights, statistics))
-        metrics |= {"loss": loss, "gradient": optax.tree.norm(gradient), "learning_rate": rate(state.step)}
+        metrics |= {"loss": loss, **{name: jnp.asarray(value, jnp.float32) for name, value in used.items()}}
         made = replace(
             state,
             step=state.step + 1,

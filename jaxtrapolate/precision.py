@@ -1,0 +1,22 @@
+"""The precision that coordinates and sums are taken in: at least float32, whatever the images are.
+
+The library's results do not depend on JAX's settings of dtypes: float32 arrays give float32 ones, and the same values,
+under `jax_enable_x64` as well, and nothing is promoted implicitly, so that `jax_numpy_dtype_promotion="strict"` and
+`jax_numpy_rank_promotion="raise"` may be set.
+"""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+_DOUBLE = (np.dtype(np.float64), np.dtype(np.complex128))
+
+
+def widest(*values: Any) -> np.dtype:
+    """float64 where one of some arrays is and `jax_enable_x64` is set, else float32.
+
+    `jnp.promote_types` is not for this: under strict promotion it refuses to compare float16 with float32.
+    """
+    double = any(value.dtype in _DOUBLE for value in values)
+    return jax.dtypes.canonicalize_dtype(np.float64 if double else np.float32)
