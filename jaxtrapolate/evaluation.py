@@ -208,7 +208,7 @@ def mean_over_inputs(
 def time_stages(method: Method, window: Window, *, repeats: int = 5) -> dict[str, Timing]:
     """Each stage of a method on its own; their sum exceeds the whole, in which XLA fuses across stages."""
     history, target, future = arguments(method, window)
-    values = {"carry": method.init(history, target), "history": history, "target": target, "future": future}
+    values = method.first_values(method.init(history, target), history, target, future)
     timings = {}
     for stage in method.active(history, target, future):
         run = method.jitted_stages[stage.name]

@@ -13,6 +13,8 @@ from jaxtyping import Array
 from jaxtrapolate.assisted import DepthKind
 from jaxtrapolate.bidirectional import interpolate_bidirectional
 from jaxtrapolate.checks import check_present
+from jaxtrapolate.depth import apart as depth_apart
+from jaxtrapolate.depth import held
 from jaxtrapolate.flows import complete_flows
 from jaxtrapolate.gather import backward_warp, in_frame, pixel_grid, sample
 from jaxtrapolate.methods.between import BETWEEN, PAIR, depth_of
@@ -125,7 +127,7 @@ def _weight(values: Values) -> Array:
         check_present(f"{name}.depth", depth_of(values[name]), needed_by="the blend")
         for name in ("target", "previous", "next")
     )
-    apart = [jnp.abs(backward_warp(there, motion) - depth) for there, motion in zip(depths, at, strict=True)]
+    apart = [depth_apart(backward_warp(held(there), motion), depth) for there, motion in zip(depths, at, strict=True)]
     likelier = jnp.where(inside[0] == inside[1], apart[1] < apart[0], inside[1])
     one = jnp.where(in_first == in_second, likelier, in_second)
     return jnp.where(in_first & in_second, values["alpha"], one.astype(values["alpha"].dtype))

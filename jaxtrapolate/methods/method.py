@@ -2,7 +2,7 @@
 
 The run, the benchmark, the plan and the reports all read that one list. A stage is a pure function of the method's
 state (its weights) and of the values so far, a dict; it returns the values that it adds. A method starts with "carry",
-"history", "target" and "future", and ends with "image". A stage on the host (a library that is not JAX) is run between
+"history", "target" and "future", frames whose depth is +inf where no surface was hit, and ends with "image". A stage on the host (a library that is not JAX) is run between
 the compiled ones around it.
 """
 
@@ -18,6 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import missing_package
+from jaxtrapolate.depth import surfaces
 from jaxtrapolate.records import Frame, check_frame
 
 Values = Mapping[str, Any]
@@ -170,8 +171,13 @@ class Method:
             raise ValueError(f"method {self.name!r}: expected one of the stages {', '.join(names)}, got {stage!r}")
         return self._advance(stages[: names.index(stage)], state, carry, history, target, future)
 
+    def first_values(self, carry: Any, history: Frames, target: Frame, future: Frames = ()) -> dict[str, Any]:
+        """What the first stage gets: the frames, whose depth is +inf where no surface was hit (`surface_depth`)."""
+        history, future = (tuple(map(surfaces, frames)) for frames in (history, future))
+        return {"carry": carry, "history": history, "target": surfaces(target), "future": future}
+
     def _advance(self, stages, state, carry, history, target, future) -> dict[str, Any]:
-        values = {"carry": carry, "history": history, "target": target, "future": future}
+        values = self.first_values(carry, history, target, future)
         for stage in stages:
             if stage.host and any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state, values))):
                 raise TypeError(
@@ -186,7 +192,7 @@ class Method:
         self._check(history, target, future)
         if target.color is not None and self.scale == 1:
             return carry, jnp.asarray(target.color)
-        values: dict[str, Any] = {"carry": carry, "history": history, "target": target, "future": future}
+        values: dict[str, Any] = self._first_values(carry, history, target, future)
         for host, group in groupby(self.active(history, target, future), key=lambda stage: stage.host):
             row = tuple(group)
             values |= _run(row, self.state, values) if host else self._rows(row)(self.state, values)
@@ -211,6 +217,10 @@ class Method:
         check_frame("target", target, size=size)
         if not rendered(history):
             raise ValueError(f"history: expected a frame with colour, got {len(history)} frames without")
+
+    @cached_property
+    def _first_values(self):
+        return jax.jit(self.first_values)
 
     @cached_property
     def _jitted(self):
