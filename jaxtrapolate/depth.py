@@ -15,13 +15,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxtrapolate.checks import ArrayLike, check_image
 from jaxtrapolate.records import Frame, Keyframe, replace
 
 _HELD = 1e30  # in place of infinity
 _MIXED = 1e20  # no surface is that far
 
 
-def surface_depth(depth: Float[Array, "h w 1"], sky: Float[Array, "h w 1"] | None = None) -> Float[Array, "h w 1"]:
+def surface_depth(
+    depth: Float[ArrayLike, "h w 1"], sky: Float[ArrayLike, "h w 1"] | None = None
+) -> Float[Array, "h w 1"]:
     """The depth, +inf where nothing was hit: where it is not positive, or the sky's mask is above 0.5.
 
     Args:
@@ -33,14 +36,19 @@ def surface_depth(depth: Float[Array, "h w 1"], sky: Float[Array, "h w 1"] | Non
 
     Gradient:
         With respect to depth: 1 at surfaces, 0 where nothing was hit.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, or a shape that does not fit.
     """
-    nothing = depth <= 0
+    size = check_image("depth", depth, channels=1)
+    bare = depth <= 0
     if sky is not None:
-        nothing |= sky > 0.5
-    return jnp.where(nothing, jnp.inf, depth)
+        check_image("sky", sky, size=size, channels=1)
+        bare = bare | (sky > 0.5)
+    return jnp.where(bare, jnp.inf, depth)
 
 
-def nothing(depth: Float[Array, "h w 1"]) -> Bool[Array, "h w 1"]:
+def nothing(depth: Float[ArrayLike, "h w 1"]) -> Bool[Array, "h w 1"]:
     """Where a depth says that no surface was hit: not positive, or +inf."""
     return (depth <= 0) | (depth == jnp.inf)
 
