@@ -86,8 +86,9 @@ class _Options(NamedTuple):
 class _Side(NamedTuple):
     """What there is of one I-frame, all rows.
 
-    depth: `held`, so that nothing is at 1e30. passed: the depth `[H, W]` of its points in the frame to be made. leads: of its flow toward the other I-frame.
-    finite: whether the colours and the depths are. latest: what the frame made last leaves.
+    depth: `held`, so that nothing is at 1e30. passed: the depth `[H, W]` of its points in the frame to be made. leads:
+    of its flow toward the other I-frame. finite: whether the colours and the depths are. latest: what the frame made
+    last leaves.
     """
 
     color: Array
@@ -367,10 +368,10 @@ def interpolate_bidirectional(
 
     Edge cases:
         A search that ends outside the frame misses, but where both miss its colour is the frame's edge. Flow that is
-        not finite misses. Depth that is not finite or not positive is as far as can be, and stays there. Errors that differ by less than 0.001 pixels
-        are equal: the point of the frame nearer in time is taken then (at 1/2 the next), of two starts' the first, so
-        that rounding decides nothing. Of equal depths that of the next frame is taken. alpha 0 takes `previous`, 1
-        `next`, also where the motion is not finite.
+        not finite misses. Depth that is not finite or not positive is as far as can be, and stays there. Errors that
+        differ by less than 0.001 pixels are equal: the point of the frame nearer in time is taken then (at 1/2 the
+        next), of two starts' the first, so that rounding decides nothing. Of equal depths that of the next frame is
+        taken. alpha 0 takes `previous`, 1 `next`, also where the motion is not finite.
 
     Gradient:
         With respect to colours, flows and alpha, through the places that the searches found (implicit function theorem,

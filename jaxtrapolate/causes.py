@@ -27,9 +27,9 @@ def disoccluded(target: Keyframe, source: Keyframe) -> Bool[Array, "h w"]:
     """Whether the surface at a target pixel was hidden in the source frame: exact, by depth.
 
     The depth that the surface had in the source frame, depth + the backward flow's change, is more than 2 % beyond the
-    source's depth (bilinear) at the place where the backward flow leads. False beyond the frame. Where one shows nothing
-    (depth that is not positive, or infinite; in the source at the pixel nearest to that place) and the other a surface,
-    it was hidden or not there; where both show nothing it was not.
+    source's depth (bilinear) at the place where the backward flow leads. False beyond the frame. Where one shows
+    nothing (depth that is not positive, or infinite; in the source at the pixel nearest to that place) and the other a
+    surface, it was hidden or not there; where both show nothing it was not.
 
     Args:
         target: with depth and backward_flow. source: the I-frame before it, with depth; both in one metric unit.
@@ -79,8 +79,8 @@ def edges(gbuffer: GBuffer, *, metric_depth: bool) -> Bool[Array, "h w 1"] | Non
     """Pixels within 2 of a jump of depth or normal; `None` without both buffers.
 
     Metric depth jumps where its inverse, which is linear on any plane, bends by more than 5 % of itself between three
-    neighbours; ordinal depth, where it bends by more than 0.05; both where a surface ends and nothing begins; the normal, where its cosine to a neighbour is below
-    0.8.
+    neighbours; ordinal depth, where it bends by more than 0.05; both where a surface ends and nothing begins; the
+    normal, where its cosine to a neighbour is below 0.8.
     """
     jumps = []
     if gbuffer.depth is not None:

@@ -50,6 +50,7 @@ def surface_depth(
 
 def nothing(depth: Float[ArrayLike, "h w 1"]) -> Bool[Array, "h w 1"]:
     """Where a depth says that no surface was hit: not positive, or +inf."""
+    depth = jnp.asarray(depth)
     return (depth <= 0) | (depth == jnp.inf)
 
 
@@ -61,11 +62,12 @@ def surfaces(frame: Frame) -> Frame:
     return replace(frame, gbuffer=replace(buffers, depth=surface_depth(jnp.asarray(buffers.depth), buffers.sky)))
 
 
-def surfaces_of(keyframe: Keyframe) -> Keyframe:
-    """A keyframe with `surface_depth`; without depth the keyframe itself."""
+def surfaces_of(keyframe: Keyframe, frame: Frame | None = None) -> Keyframe:
+    """A keyframe with `surface_depth`, by the sky of its frame if that has any; without depth the keyframe itself."""
     if keyframe.depth is None:
         return keyframe
-    return replace(keyframe, depth=surface_depth(jnp.asarray(keyframe.depth)))
+    sky = None if frame is None or frame.gbuffer is None else frame.gbuffer.sky
+    return replace(keyframe, depth=surface_depth(jnp.asarray(keyframe.depth), sky))
 
 
 def changed(depth: Array, change: Array) -> Array:

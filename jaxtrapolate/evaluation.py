@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.causes import CAUSES, cause_map, disoccluded
 from jaxtrapolate.checks import ArrayLike, check_present
+from jaxtrapolate.depth import surfaces_of
 from jaxtrapolate.files import Sequence, prefetch, runs
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.metrics import Metric, psnr
@@ -102,6 +103,7 @@ def causes_of(sequence: Sequence, window: Window) -> np.ndarray | None:
     hidden, metric = None, sequence.depth == "metric"
     if metric and target is not None and source is not None:
         exact = target.backward_flow is not None and source.depth is not None
+        target, source = surfaces_of(target, window.truth), surfaces_of(source, window.history[-1])
         hidden = disoccluded(replace(target, color=None), replace(source, color=None)) if exact else None
     return np.asarray(cause_map(window.truth, window.history[-1], motion, hidden=hidden, metric_depth=metric))
 

@@ -194,7 +194,8 @@ def complete_flows(previous: Keyframe, next: Keyframe, *, depth: DepthKind = "me
         depth: "metric" (distance along the view axis), or "ordinal" (only its order counts).
 
     Returns:
-        `CompletedFlows`. What was given is kept as it is, but nothing has depth +inf. Flow vectors of a splat are of the dtype of the given flow.
+        `CompletedFlows`. What was given is kept as it is, but nothing has depth +inf. Flow vectors of a splat are of
+        the dtype of the given flow.
 
     Convention:
         Pixels to add, x right, y down; each flow belongs to its own keyframe's grid.
@@ -202,8 +203,8 @@ def complete_flows(previous: Keyframe, next: Keyframe, *, depth: DepthKind = "me
     Edge cases:
         Where no pixel in the same row and column got a flow, it is 0. Given vectors that are not finite are not
         splatted, but where nothing was hit a change of depth does not matter: what is far stays far, and a derived
-        change is 0 there. A derived change of depth makes depth tests along it blind to all but jumps of 20 %; a round trip
-        of the flows says more then (`interpolate_bidirectional`, visibility).
+        change is 0 there. A derived change of depth makes depth tests along it blind to all but jumps of 20 %; a round
+        trip of the flows says more then (`interpolate_bidirectional`, visibility).
 
     Gradient:
         With respect to the flow and depth values as picked; which are picked is held fixed.

@@ -173,7 +173,7 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
             known = _dot(place, place) + _dot(target.position, target.position) < jnp.inf
             apart = jnp.where(known, place - target.position, 0)
             squared = jnp.where(known, _dot(apart, apart), jnp.inf)
-            if around:
+            if bare is not None:
                 squared = jnp.where(around[k][0] != bare[0], jnp.inf, jnp.where(bare[0], 0, squared))
             if taps != "release":
                 squared = jnp.where(weight > 0, squared, 0)
@@ -243,7 +243,8 @@ def hole_masks(
         NaN depth is a surface's.
 
     Gradient:
-        Only of soft masks: with respect to motion, normals, positions, thresholds and softness; not to ids, depth and sky.
+        Only of soft masks: with respect to motion, normals, positions, thresholds and softness; not to ids, depth and
+        sky.
 
     Raises:
         TypeError, ValueError: no floating-point array, a size that differs, an unknown `taps`.

@@ -163,8 +163,8 @@ def occlusion_motion(motion: Float[Array, "h w 2"], depth: Float[Array, "h w 1"]
     its own motion lands, floored and held to the frame.
 
     Args:
-        motion: `[H, W, 2]` from the target to the source frame. depth: `[H, W, 1]` of the target; what is not positive is
-            nothing, and behind all surfaces.
+        motion: `[H, W, 2]` from the target to the source frame. depth: `[H, W, 1]` of the target; what is not positive
+            is nothing, and behind all surfaces.
 
     Returns:
         `[H, W, 2]`; 0 where nothing was splatted to. A pixel that is nobody's background gets its own or a like vector.

@@ -2,14 +2,14 @@
 
 The run, the benchmark, the plan and the reports all read that one list. A stage is a pure function of the method's
 state (its weights) and of the values so far, a dict; it returns the values that it adds. A method starts with "carry",
-"history", "target" and "future", frames whose depth is +inf where no surface was hit, and ends with "image". A stage on the host (a library that is not JAX) is run between
-the compiled ones around it.
+"history", "target" and "future", frames whose depth is +inf where no surface was hit, and ends with "image". A stage on
+the host (a library that is not JAX) is run between the compiled ones around it.
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import Any, Literal
 
 import jax
@@ -103,7 +103,7 @@ def neighbours(
     numbers = range(count) if numbers is None else numbers
     if len(numbers) != count:
         raise ValueError(f"numbers: expected {count} as there are frames, got {len(numbers)}")
-    steps = [later - earlier for earlier, later in zip(numbers, numbers[1:], strict=False)]
+    steps = [later - earlier for earlier, later in pairwise(numbers)]
     if any(step <= 0 for step in steps):
         raise ValueError(f"numbers: expected each above the one before, got {list(numbers)}")
 
