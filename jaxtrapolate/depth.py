@@ -80,7 +80,8 @@ def apart(first: Array, second: Array) -> Array:
 
     Where one is, more than any two surfaces, and the less the farther the other is: 1e30 / other. No gradient.
     """
-    first, second = jax.lax.stop_gradient((held(first), held(second)))
+    wide = jnp.promote_types(first.dtype, second.dtype)
+    first, second = jax.lax.stop_gradient(tuple(held(a.astype(wide)) for a in (first, second)))
     near = jnp.minimum(first, second)
     one = (first < _HELD) != (second < _HELD)
     return jnp.where(one, _HELD / jnp.where(near > 0, near, 1), jnp.abs(first - second))

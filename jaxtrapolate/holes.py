@@ -54,7 +54,7 @@ def _footprint(position, bare):
     A neighbour that shows nothing, or whose position is not finite, does not count; 0 without neighbours.
     """
     result = None
-    known = jnp.all(jnp.isfinite(position), -1, keepdims=True)
+    known = _dot(position, position) < jnp.inf
     known = known if bare is None else known & ~bare
     position = jnp.where(known, position, 0)
     for axis in (0, 1):
