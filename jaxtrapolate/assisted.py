@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image, check_present
+from jaxtrapolate.depth import held, released, surface_depth
 from jaxtrapolate.gather import Filter, all_finite, sample, weigh, where_finite
 from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Keyframe, record, replace
@@ -108,7 +109,8 @@ def shown(
 ) -> Bool[Array, "i j 1"]:
     """Whether a point of the expected depth is what a frame shows at `at`: inside, and its depth agrees.
 
-    finite: what `all_finite` says of the depth, where that is known.
+    finite: what `all_finite` says of the depth, where that is known. Depths should be `held`: a mixture of a surface
+    with nothing then agrees with what it is nearly all of.
     """
     found = fetch_finite(depth, at, "bilinear", finite).astype(expected.dtype)
     return within(at, *depth.shape[:2])[..., None] & agree(found, expected, epsilon, "metric")
@@ -141,6 +143,8 @@ def _part(sources, top, rows: int, *, filter: Filter) -> Interpolation:
     grid = positions(rows, depth.shape[1], alpha.dtype, top=top)
     ways = []
     for (color, buffer, finite), flow in zip(frames, flows, strict=True):
+        # what is far stays far, whatever the change of its depth
+        flow = jnp.concatenate([flow[..., :2], jnp.where(released(depth) == jnp.inf, 0, flow[..., 2:])], -1)
         known = jnp.all(jnp.isfinite(flow), -1, keepdims=True)
         flow = jnp.where(known, flow, 0)
         at = grid + flow[..., :2]
@@ -155,13 +159,15 @@ def _part(sources, top, rows: int, *, filter: Filter) -> Interpolation:
     weight = jnp.where(in_first & in_second, alpha, one)
     missed = ~(in_first | in_second)[..., 0]
     case = jnp.where(missed, CASES.index("missed"), CASES.index("assisted")).astype(jnp.int32)
-    return Interpolation(blend(first, second, weight), weight, case, forward, backward, depth)
+    return Interpolation(blend(first, second, weight), weight, case, forward, backward, released(depth))
 
 
 @partial(jax.jit, static_argnames=("filter",))
 def _assisted(previous, next, target, alpha, epsilon, *, filter):
     wide = widest(target.forward_flow)
     alpha, epsilon = (jnp.asarray(a).astype(wide) for a in (alpha, epsilon))
+    depths = [held(surface_depth(jnp.asarray(f.depth))) for f in (previous, next, target)]
+    previous, next, target = (replace(f, depth=d) for f, d in zip((previous, next, target), depths, strict=True))
     frames = tuple((f.color, f.depth, (all_finite(f.color), all_finite(f.depth))) for f in (previous, next))
     sources = frames, (target.depth, target.backward_flow, target.forward_flow), alpha, epsilon
     return by_strips(partial(_part, filter=filter), target.depth.shape[0], sources)
@@ -198,10 +204,11 @@ def interpolate_assisted(
         An `Interpolation` without offsets.
 
     Convention:
-        The target's flows belong to its own grid, and are added; depth is along the view axis, metric.
+        The target's flows belong to its own grid, and are added; depth is along the view axis, metric; what is not
+        positive is nothing, as far as +inf, and stays there.
 
     Edge cases:
-        Flow or depth that is not finite (but depths that are infinite in both) is visible nowhere; non-finite flow
+        Flow or depth that is not finite (but where both show nothing) is visible nowhere; non-finite flow
         looks at the pixel itself. What is outside a frame is not visible in it; closest-on-miss repeats the frame's
         edge there, and takes the earlier frame where depths are equal or unknown.
 
@@ -237,7 +244,8 @@ def drawn_over(below: Interpolation, above: Interpolation, covered: Array, epsil
     drawn = covered[..., None]
     depth = below.depth
     if depth is not None and above.depth is not None:
-        over = above.depth.astype(depth.dtype)
+        depth = surface_depth(depth)
+        over = surface_depth(above.depth).astype(depth.dtype)
         drawn &= (over <= depth) | agree(over, depth, epsilon, "metric")
         depth = jnp.where(drawn, over, depth)
     return replace(
@@ -267,7 +275,7 @@ def overlay(
 
     Returns:
         `below` with color, depth and case exchanged where something was drawn that is not hidden. Without a depth below
-        nothing hides it; a NaN depth is hidden.
+        nothing hides it; a NaN depth is hidden. A depth that is not positive is nothing, and behind all surfaces.
 
     Gradient:
         With respect to both colours and depths as picked; the pick is held fixed.

@@ -28,6 +28,7 @@ from jaxtrapolate.assisted import (
     shown,
 )
 from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image, check_present
+from jaxtrapolate.depth import held, released, surface_depth
 from jaxtrapolate.gather import Filter, all_finite, inside, sample
 from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Keyframe, replace
@@ -86,8 +87,9 @@ class _Options(NamedTuple):
 class _Side(NamedTuple):
     """What there is of one I-frame, all rows.
 
-    passed: the depth `[H, W]` of its points in the frame to be made. leads: of its flow toward the other I-frame.
-    finite: whether the colours and the depths are. latest: what the frame made last leaves.
+    depth: `held`, so that nothing is at 1e30. passed: the depth `[H, W]` of its points in the frame to be made. leads:
+    of its flow toward the other I-frame. finite: whether the colours and the depths are. latest: what the frame made
+    last leaves.
     """
 
     color: Array
@@ -235,7 +237,7 @@ def _part(sources, top, rows: int, *, options: _Options) -> tuple[Interpolation,
         Correspondence(a.at, side.fraction * a.flow[..., 2:] if side.flow.shape[2] == 3 else None, a.error)
         for a, side in ((f, previous), (b, next))
     )
-    depth = jnp.where(take_f, f.depth, b.depth) if known else None
+    depth = released(jnp.where(take_f, f.depth, b.depth)) if known else None
     return Interpolation(color, weight, case[..., 0].astype(jnp.int32), forward, backward, depth), tuple(left)
 
 
@@ -250,8 +252,9 @@ def _interpolate(previous, next, alpha, offsets, epsilon_error, epsilon_depth, e
         flow, known = flow.astype(wide), None
         if offset is not None:
             known = LatestOffsets(offset.astype(wide), last_depth, _ratio(fraction, last))
-        depth, passed = None if options.depth == "absent" else frame.depth, None
-        if depth is not None:
+        depth, passed = None, None
+        if options.depth != "absent":
+            depth = held(surface_depth(jnp.asarray(frame.depth)))
             passed = depth[..., 0].astype(wide)
             if options.depth == "metric" and flow.shape[2] == 3:
                 change = flow[..., 2]
@@ -366,10 +369,10 @@ def interpolate_bidirectional(
 
     Edge cases:
         A search that ends outside the frame misses, but where both miss its colour is the frame's edge. Flow that is
-        not finite misses. Depth that is not finite is as far as can be. Errors that differ by less than 0.001 pixels
-        are equal: the point of the frame nearer in time is taken then (at 1/2 the next), of two starts' the first, so
-        that rounding decides nothing. Of equal depths that of the next frame is taken. alpha 0 takes `previous`, 1
-        `next`, also where the motion is not finite.
+        not finite misses. Depth that is not finite or not positive is as far as can be, and stays there. Errors that
+        differ by less than 0.001 pixels are equal: the point of the frame nearer in time is taken then (at 1/2 the
+        next), of two starts' the first, so that rounding decides nothing. Of equal depths that of the next frame is
+        taken. alpha 0 takes `previous`, 1 `next`, also where the motion is not finite.
 
     Gradient:
         With respect to colours, flows and alpha, through the places that the searches found (implicit function theorem,

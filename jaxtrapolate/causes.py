@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrapolate.checks import check_image, check_present
+from jaxtrapolate.depth import changed, surface_depth
 from jaxtrapolate.gather import backward_warp, in_frame
 from jaxtrapolate.holes import hole_masks
 from jaxtrapolate.records import Frame, GBuffer, Keyframe, check_frame
@@ -26,7 +27,9 @@ def disoccluded(target: Keyframe, source: Keyframe) -> Bool[Array, "h w"]:
     """Whether the surface at a target pixel was hidden in the source frame: exact, by depth.
 
     The depth that the surface had in the source frame, depth + the backward flow's change, is more than 2 % beyond the
-    source's depth (bilinear) at the place where the backward flow leads. False beyond the frame.
+    source's depth (bilinear) at the place where the backward flow leads. False beyond the frame. Where one shows
+    nothing (depth that is not positive, or infinite; in the source at the pixel nearest to that place) and the other a
+    surface, it was hidden or not there; where both show nothing it was not.
 
     Args:
         target: with depth and backward_flow. source: the I-frame before it, with depth; both in one metric unit.
@@ -43,9 +46,12 @@ def disoccluded(target: Keyframe, source: Keyframe) -> Bool[Array, "h w"]:
     check_image("source.depth", source.depth, size=size, channels=1)
     depth, source_depth = cast(Array, target.depth), cast(Array, source.depth)  # `check_image` has refused None
     motion = flow[..., :2]
-    expected = (depth + flow[..., 2:])[..., 0]
-    found = backward_warp(source_depth, motion)[..., 0]
-    return in_frame(motion) & (found < (1 - _HIDDEN) * expected)
+    depth, source_depth = surface_depth(depth), surface_depth(source_depth)
+    expected = changed(depth, flow[..., 2:])[..., 0]
+    found, nearest = (backward_warp(source_depth, motion, filter=f)[..., 0] for f in ("bilinear", "nearest"))
+    found = jnp.where(jnp.isinf(found), nearest, found)  # of a pixel beside the silhouette
+    hidden = jnp.where(jnp.isinf(nearest), expected < jnp.inf, found < (1 - _HIDDEN) * expected)
+    return in_frame(motion) & hidden
 
 
 def _neighbours(image, reach):
@@ -73,21 +79,25 @@ def edges(gbuffer: GBuffer, *, metric_depth: bool) -> Bool[Array, "h w 1"] | Non
     """Pixels within 2 of a jump of depth or normal; `None` without both buffers.
 
     Metric depth jumps where its inverse, which is linear on any plane, bends by more than 5 % of itself between three
-    neighbours; ordinal depth, where it bends by more than 0.05; the normal, where its cosine to a neighbour is below
-    0.8.
+    neighbours; ordinal depth, where it bends by more than 0.05; both where a surface ends and nothing begins; the
+    normal, where its cosine to a neighbour is below 0.8.
     """
     jumps = []
     if gbuffer.depth is not None:
-        value = jnp.where(gbuffer.depth > 0, 1 / jnp.where(gbuffer.depth > 0, gbuffer.depth, 1), 0)
-        value = value if metric_depth else gbuffer.depth
+        depth = surface_depth(gbuffer.depth, gbuffer.sky)
+        bare = ~(depth < jnp.inf)
+        value = jnp.where(bare, 0, 1 / jnp.where(bare, 1, depth)) if metric_depth else jnp.where(bare, 0, depth)
         scale = value if metric_depth else jnp.ones_like(value)
         for axis in (0, 1):
             if value.shape[axis] < 3:
                 continue
             size = value.shape[axis]
-            low, middle, high = (jax.lax.slice_in_dim(value, k, size - 2 + k, axis=axis) for k in range(3))
+            (low, l), (middle, m), (high, h) = (
+                tuple(jax.lax.slice_in_dim(a, k, size - 2 + k, axis=axis) for a in (value, bare)) for k in range(3)
+            )
             reference = jax.lax.slice_in_dim(scale, 1, size - 1, axis=axis)
             bent = jnp.abs(low - 2 * middle + high) > _JUMP * jnp.abs(reference)
+            bent |= (l != m) | (h != m)
             padding = [(0, 0)] * 3
             padding[axis] = (1, 1)
             jumps.append(jnp.pad(bent, padding))

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.causes import CAUSES, cause_map, disoccluded
 from jaxtrapolate.checks import ArrayLike, check_present
+from jaxtrapolate.depth import surfaces_of
 from jaxtrapolate.files import Sequence, around, prefetch, runs
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.metrics import Metric, psnr
@@ -111,6 +112,7 @@ def causes_of(sequence: Sequence, window: Window) -> np.ndarray | None:
     hidden, metric = None, sequence.depth == "metric"
     if metric and target is not None and source is not None:
         exact = target.backward_flow is not None and source.depth is not None
+        target, source = surfaces_of(target, window.truth), surfaces_of(source, window.history[-1])
         hidden = disoccluded(replace(target, color=None), replace(source, color=None)) if exact else None
     return np.asarray(cause_map(window.truth, window.history[-1], motion, hidden=hidden, metric_depth=metric))
 
@@ -217,7 +219,7 @@ def mean_over_inputs(
 def time_stages(method: Method, window: Window, *, repeats: int = 5) -> dict[str, Timing]:
     """Each stage of a method on its own; their sum exceeds the whole, in which XLA fuses across stages."""
     history, target, future = arguments(method, window)
-    values = {"carry": method.init(history, target), "history": history, "target": target, "future": future}
+    values = method.first_values(method.init(history, target), history, target, future)
     timings = {}
     for stage in method.active(history, target, future):
         run = method.jitted_stages[stage.name]

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.checks import ArrayLike, Size, check_image
+from jaxtrapolate.depth import surface_depth
 from jaxtrapolate.gather import take_rows
 from jaxtrapolate.precision import widest
 
@@ -107,7 +108,8 @@ def fill_around(
 
     Args:
         image: `[H, W, C]`. covered: bool `[H, W]`, False in holes.
-        depth: `[H, W, 1]` of the image, smaller is nearer; without it the closest of the four pixels is taken.
+        depth: `[H, W, 1]` of the image, smaller is nearer, what is not positive is nothing, and the farthest; without
+            it the closest of the four pixels is taken.
 
     Returns:
         `[H, W, C]`; covered pixels as they are. Of equal depths the closest, then left before right before above. Zero
@@ -127,7 +129,8 @@ def fill_around(
     far = None
     if depth is not None:
         check_image("depth", depth, size=size, channels=1)
-        far = jnp.where(jnp.isnan(depth), -jnp.inf, depth).reshape(-1)
+        far = surface_depth(jnp.asarray(depth))
+        far = jnp.where(jnp.isnan(far), -jnp.inf, far).reshape(-1)
     covered = jnp.asarray(covered)
     row, column = (jax.lax.broadcasted_iota(jnp.int32, size, k) for k in (0, 1))
     best = jnp.full(size, -1, jnp.int32)

@@ -15,6 +15,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.assisted import DepthKind
 from jaxtrapolate.checks import Size, check_choice, check_image
+from jaxtrapolate.depth import apart as depth_apart
+from jaxtrapolate.depth import changed, held, surfaces_of
 from jaxtrapolate.gather import sample, take_rows
 from jaxtrapolate.motion import camera_motion
 from jaxtrapolate.precision import widest
@@ -136,7 +138,7 @@ def _fill(flow, covered, depth):
         far = jnp.abs(found - (column if axis == 1 else row))
         differs = jnp.zeros(covered.shape, jnp.float32)
         if depth is not None:
-            differs = jnp.abs(take_rows(depth.reshape(-1, 1), index) - depth)[..., 0].astype(jnp.float32)
+            differs = depth_apart(take_rows(depth.reshape(-1, 1), index), depth)[..., 0].astype(jnp.float32)
             differs = jnp.where(jnp.isnan(differs), jnp.float32(jnp.finfo(jnp.float32).max), differs)
         better = (found >= 0) & ((differs < apart) | ((differs == apart) & (far < steps)))
         best = jnp.where(better[..., None], take_rows(rows, index), best)
@@ -149,16 +151,19 @@ def _turned(flow, own_depth, other_depth, metric):
 
     A point that lands where the other frame shows quite another depth is hidden there, and left out.
     """
-    own_depth = jnp.zeros((*flow.shape[:2], 1), flow.dtype) if own_depth is None else own_depth.astype(flow.dtype)
+    known = own_depth is not None
+    own_depth = own_depth.astype(flow.dtype) if known else jnp.zeros((*flow.shape[:2], 1), flow.dtype)
     other_depth = None if other_depth is None else other_depth.astype(flow.dtype)
-    carried = own_depth + flow[..., 2:] if flow.shape[-1] == 3 else own_depth
+    carried = own_depth
+    if flow.shape[-1] == 3 and known:
+        carried = changed(own_depth, flow[..., 2:])
+        flow = jnp.concatenate([flow[..., :2], jnp.where(own_depth == jnp.inf, 0, flow[..., 2:])], -1)
     index, covered = splat_source(flow[..., :2], carried)
     rows = jnp.concatenate([-flow, carried], -1)
     taken = take_rows(rows.reshape(-1, rows.shape[-1]), index)
-    if metric and other_depth is not None:
-        covered &= (jnp.abs(taken[..., -1:] - other_depth) <= _HIDDEN * jnp.abs(other_depth))[..., 0] | (
-            taken[..., -1:] == other_depth
-        )[..., 0]
+    if metric and known and other_depth is not None:
+        same = depth_apart(taken[..., -1:], other_depth) <= _HIDDEN * other_depth
+        covered &= (same & ((taken[..., -1:] == jnp.inf) == (other_depth == jnp.inf)))[..., 0]
     return _fill(jnp.where(covered[..., None], taken[..., :-1], 0), covered, other_depth), covered
 
 
@@ -167,8 +172,9 @@ def _deepened(flow, depth, other_depth):
     finite = jnp.all(jnp.isfinite(flow), -1, keepdims=True)
     at = positions(flow.shape[0], flow.shape[1], flow.dtype) + jnp.where(finite, flow, 0)
     depth = depth.astype(flow.dtype)
-    change = sample(other_depth, at[..., 0], at[..., 1]).astype(flow.dtype) - depth
-    same = jnp.abs(change) <= _HIDDEN * jnp.abs(depth)
+    own = held(depth)
+    change = sample(held(other_depth), at[..., 0], at[..., 1]).astype(flow.dtype) - own
+    same = (jnp.abs(change) <= _HIDDEN * own) & jnp.isfinite(depth)
     used = finite & same & within(at, *depth.shape[:2])[..., None]
     return jnp.concatenate([flow, jnp.where(used, change, 0)], -1)
 
@@ -186,19 +192,22 @@ def complete_flows(previous: Keyframe, next: Keyframe, *, depth: DepthKind = "me
 
     Args:
         previous, next: of which forward_flow and backward_flow count, the flows between the two, `[H, W, 3]` or,
-            without the change of depth, `[H, W, 2]`; at least one; and depth `[H, W, 1]`, which may be absent.
+            without the change of depth, `[H, W, 2]`; at least one; and depth `[H, W, 1]`, which may be absent; what is
+            not positive is nothing, and far.
         depth: "metric" (distance along the view axis), or "ordinal" (only its order counts).
 
     Returns:
-        `CompletedFlows`. What was given is kept as it is. Flow vectors of a splat are of the dtype of the given flow.
+        `CompletedFlows`. What was given is kept as it is, but nothing has depth +inf. Flow vectors of a splat are of
+        the dtype of the given flow.
 
     Convention:
         Pixels to add, x right, y down; each flow belongs to its own keyframe's grid.
 
     Edge cases:
         Where no pixel in the same row and column got a flow, it is 0. Given vectors that are not finite are not
-        splatted. A derived change of depth makes depth tests along it blind to all but jumps of 20 %; a round trip
-        of the flows says more then (`interpolate_bidirectional`, visibility).
+        splatted, but where nothing was hit a change of depth does not matter: what is far stays far, and a derived
+        change is 0 there. A derived change of depth makes depth tests along it blind to all but jumps of 20 %; a round
+        trip of the flows says more then (`interpolate_bidirectional`, visibility).
 
     Gradient:
         With respect to the flow and depth values as picked; which are picked is held fixed.
@@ -218,6 +227,7 @@ def complete_flows(previous: Keyframe, next: Keyframe, *, depth: DepthKind = "me
     for name, value in (("previous.depth", previous.depth), ("next.depth", next.depth)):
         if value is not None:
             check_image(name, value, size=size, channels=1)
+    previous, next = surfaces_of(previous), surfaces_of(next)
     forward, backward = previous.forward_flow, next.backward_flow
     forward_known = backward_known = None
     derived: tuple[str, ...] = ()

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
+from jaxtrapolate.depth import surfaces
 from jaxtrapolate.gather import backward_warp
 from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Frame, GBuffer, check_frame, replace
@@ -25,7 +26,8 @@ def forecast(frame: Frame, fraction: float | Float[Array, ""]) -> Frame:
     buffers of a frame.
 
     Args:
-        frame: with motion; depth decides what hides what, without it everything is at one depth.
+        frame: with motion; depth decides what hides what, without it everything is at one depth. What it shows of
+            nothing (depth that is not positive, the sky) lies behind all, and has depth +inf in the result.
         fraction: of the step from the frame before to `frame`; 0.5 is half way to a next frame.
 
     Returns:
@@ -35,6 +37,7 @@ def forecast(frame: Frame, fraction: float | Float[Array, ""]) -> Frame:
         TypeError, ValueError: no motion, or buffers whose sizes differ.
     """
     check_frame("frame", frame)
+    frame = surfaces(frame)
     back = check_present("frame.motion", frame.motion, needed_by="forecast")
     fraction = jnp.asarray(fraction).astype(back.dtype)
     onward = -fraction * back

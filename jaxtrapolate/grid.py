@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.checks import ArrayLike, check_image
+from jaxtrapolate.depth import held, surface_depth
 from jaxtrapolate.gather import landing, pixel_grid, sample, take_rows
 from jaxtrapolate.precision import widest
 from jaxtrapolate.scatter import splat_source
 
 _STEP = 0.1  # relative: a neighbour farther by more is another surface
 _LONGEST = 2.8  # cells: drawn at two samples a pixel, a longer edge would leave gaps
-_FAR = 1e30  # stands for infinite depth
 
 
 def _axis(size: int, cell: int) -> np.ndarray:
@@ -155,7 +155,8 @@ def grid_warp(
     the nearest cell that covers it, its place in that cell (the inverse of the bilinear map), and the colour there.
 
     Args:
-        image: `[H, W, C]`. flow: `[H, W, 2]` in pixels. depth: `[H, W, 1]`, smaller is nearer; `None`: all as near.
+        image: `[H, W, C]`. flow: `[H, W, 2]` in pixels. depth: `[H, W, 1]`, smaller is nearer, what is not positive is
+            nothing, and the farthest; `None`: all as near.
         fraction: of the flow, traced.
         cell: the distance of vertices in pixels, about: they are spread evenly from the first to the last pixel.
         snap: whether a vertex moves to the closest pixel (within half a cell) of a near surface's rim, where the next
@@ -193,13 +194,14 @@ def grid_warp(
     check_image("flow", flow, size=size, channels=2)
     if depth is not None:
         check_image("depth", depth, size=size, channels=1)
+        depth = surface_depth(jnp.asarray(depth))
     if not isinstance(cell, int) or cell < 1:
         raise ValueError(f"cell: expected an integer of at least 1, got {cell!r}")
     wide = widest(flow)
     fraction = jnp.asarray(fraction).astype(wide)
     x, y = _axis(width, cell), _axis(height, cell)
     if depth is not None and snap:
-        places = _snapped(jax.lax.stop_gradient(jnp.asarray(depth)), x, y, cell)
+        places = _snapped(jax.lax.stop_gradient(depth), x, y, cell)
     else:
         places = jnp.stack(jnp.broadcast_arrays(jnp.asarray(x)[None, :], jnp.asarray(y)[:, None]), -1)
     index = places[..., 1] * width + places[..., 0]
@@ -223,8 +225,7 @@ def grid_warp(
     if depth is None:
         nearness = jnp.zeros(frame, wide)
     else:
-        held = jnp.clip(jnp.asarray(depth).astype(wide), -_FAR, _FAR)
-        nearness = _spread(take_rows(held.reshape(-1, 1), index)[..., 0], n)
+        nearness = _spread(take_rows(held(depth).astype(wide).reshape(-1, 1), index)[..., 0], n)
     offset = jnp.stack([jnp.where(drawn, k, jnp.nan) for k in offset], -1)
     source, covered = splat_source(offset, nearness[..., None])
     source, covered = source[:height, :width], covered[:height, :width]

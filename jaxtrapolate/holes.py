@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image
+from jaxtrapolate.depth import nothing, surface_depth
 from jaxtrapolate.gather import backward_warp, cell, inside, landing, root, sample, take_offsets
 from jaxtrapolate.records import GBuffer, check_gbuffer, record
 
@@ -20,19 +21,20 @@ Taps = Literal["weighted", "nearest", "release"]
 class HoleMasks:
     """Masks `[H, W, 1]`, True (or towards 1, where softness > 0) where a warped pixel is invalid; `None` = no buffers.
 
-    stencil: another dynamic object. normal: another side of one. position: another place of the static scene. outside:
-    beyond the frame.
+    stencil: another dynamic object. normal: another side of one. position: another place of the static scene. depth:
+    nothing instead of a surface, or a surface instead of nothing. outside: beyond the frame.
     """
 
     stencil: Array | None = None
     normal: Array | None = None
     position: Array | None = None
+    depth: Array | None = None
     outside: Array | None = None
 
     @property
     def any(self) -> Array:
         """The union of the masks that are there; of soft ones 1 - prod(1 - mask)."""
-        masks = [m for m in (self.stencil, self.normal, self.position, self.outside) if m is not None]
+        masks = [m for m in (self.stencil, self.normal, self.position, self.depth, self.outside) if m is not None]
         if not masks:
             raise ValueError("HoleMasks.any: no mask is there")
         if all(m.dtype == jnp.bool_ for m in masks):
@@ -46,16 +48,24 @@ def _dot(a, b):
     return cast(Array, sum(terms))  # there is a channel, so that it is not the int 0
 
 
-def _footprint(position):
-    """The distance of each pixel's position to the nearer of its neighbours, the larger one of the two axes."""
+def _footprint(position, bare):
+    """The distance of each pixel's position to the nearer of its neighbours, the larger one of the two axes.
+
+    A neighbour that shows nothing, or whose position is not finite, does not count; 0 without neighbours.
+    """
     result = None
+    known = _dot(position, position) < jnp.inf
+    known = known if bare is None else known & ~bare
+    position = jnp.where(known, position, 0)
     for axis in (0, 1):
         if position.shape[axis] == 1:
             continue
         step = jnp.diff(position, axis=axis)
-        squared = _dot(step, step)
+        whole = [jax.lax.slice_in_dim(known, k, known.shape[axis] - 1 + k, axis=axis) for k in (0, 1)]
+        squared = jnp.where(whole[0] & whole[1], _dot(step, step), jnp.inf)
         first, last = (jax.lax.slice_in_dim(squared, *ends, axis=axis) for ends in ((0, 1), (-1, None)))
         nearer = jnp.minimum(jnp.concatenate([first, squared], axis), jnp.concatenate([squared, last], axis))
+        nearer = jnp.where(nearer < jnp.inf, nearer, 0)
         result = nearer if result is None else jnp.maximum(result, nearer)
     return jnp.zeros_like(position[..., :1]) if result is None else root(result)
 
@@ -73,6 +83,16 @@ def _taps(image, x, y, taps):
     return list(zip(values, [(1 - t) * (1 - u), t * (1 - u), (1 - t) * u, t * u], strict=False))
 
 
+def _bare(target, source):
+    """Where the two show no surface, by the sky and the depth that both have, bool `[H, W, 1]`; without, `None`."""
+    masks = []
+    if target.sky is not None and source.sky is not None:
+        masks.append([g.sky > 0.5 for g in (target, source)])
+    if target.depth is not None and source.depth is not None:
+        masks.append([nothing(g.depth) for g in (target, source)])
+    return [reduce(jnp.logical_or, side) for side in zip(*masks, strict=True)] if masks else None
+
+
 def _soft(excess, softness):
     """0.5 at excess 0; excess is relative to the threshold."""
     return jax.nn.sigmoid(excess / jnp.asarray(softness, excess.dtype))
@@ -85,7 +105,19 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
     x, y, finite = landing(motion)
     seen = (finite & inside(x, y, height, width))[..., None]
     outside = ~seen
+    bare, around, neither = _bare(target, source) if taps != "release" else None, [], jnp.zeros(outside.shape, bool)
     both = {name: getattr(target, name) is not None and getattr(source, name) is not None for name in _READ}
+
+    depth = None
+    if bare is not None:
+        around = [(there > 0.5, weight) for there, weight in _taps(bare[1].astype(motion.dtype), x, y, taps)]
+        other = jnp.zeros(outside.shape, motion.dtype)
+        differs = jnp.zeros(outside.shape, bool)
+        for there, weight in around:
+            other = other + jnp.where(there != bare[0], weight.astype(motion.dtype), 0)
+            differs |= (there != bare[0]) & (weight > 0)
+        depth = jnp.where(seen, other, 0) if soft else differs & seen
+        neither = bare[0] & ~differs
 
     stencil = static = None
     if both["stencil"] and taps == "release":
@@ -117,7 +149,7 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
         if taps != "release":  # the mean of unit vectors is shorter than they are
             lengths = here * there
             cosine = jnp.where(lengths > 0, cosine / jnp.sqrt(jnp.where(lengths > 0, lengths, 1)), 0)
-            concerned &= seen
+            concerned &= seen & ~neither
         least = jnp.asarray(normal_threshold, cosine.dtype)
         if soft:
             normal = jnp.where(concerned, _soft((least - cosine) / (1 - least), softness), 0)
@@ -131,22 +163,26 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
             n_dot_v = 1.0 if target.n_dot_v is None else jnp.abs(target.n_dot_v)
             limit = facing * n_dot_v + grazing * (1 - n_dot_v) + jnp.zeros(outside.shape, motion.dtype)
         else:
-            limit, per_depth = _footprint(target.position), _PER_DEPTH
-            limit = jnp.asarray(position_threshold, limit.dtype) * limit
+            limit = _footprint(target.position, None if bare is None else bare[0])
+            limit, per_depth = jnp.asarray(position_threshold, limit.dtype) * limit, _PER_DEPTH
         if target.depth is not None:
-            limit = limit + jnp.where(jnp.isfinite(target.depth), per_depth * jnp.abs(target.depth), 0)
+            whole = surface_depth(target.depth, target.sky)
+            whole = jnp.where(jnp.isfinite(whole), whole, 0)
+            limit = limit + per_depth * whole
         farthest = jnp.zeros(outside.shape, target.position.dtype)
-        for place, weight in _taps(source.position, x, y, taps):
+        for k, (place, weight) in enumerate(_taps(source.position, x, y, taps)):
             known = _dot(place, place) + _dot(target.position, target.position) < jnp.inf
             apart = jnp.where(known, place - target.position, 0)
             squared = jnp.where(known, _dot(apart, apart), jnp.inf)
+            if bare is not None:
+                squared = jnp.where(around[k][0] != bare[0], jnp.inf, jnp.where(bare[0], 0, squared))
             if taps != "release":
                 squared = jnp.where(weight > 0, squared, 0)
             farthest = jnp.maximum(farthest, squared)
         if taps == "release":
             farthest = jnp.where(outside, jnp.inf, farthest)
         concerned = still if taps == "release" else still & seen
-        if both["sky"]:
+        if both["sky"] and taps == "release":
             concerned &= (target.sky < 0.5) | (sample(source.sky, x, y, filter="nearest") < 0.5)
         if soft:
             limit = jnp.where(limit > 0, limit, jnp.finfo(limit.dtype).tiny)
@@ -157,7 +193,7 @@ def _hole_masks(target, source, motion, thresholds, *, taps, soft, absolute):
             position = concerned & ~((farthest <= jnp.square(limit)) & (farthest < jnp.inf))
 
     out = outside.astype(motion.dtype) if soft else outside
-    return HoleMasks(stencil=stencil, normal=normal, position=position, outside=out)
+    return HoleMasks(stencil=stencil, normal=normal, position=position, depth=depth, outside=out)
 
 
 _READ = ("stencil", "normal", "position", "sky")
@@ -178,9 +214,11 @@ def hole_masks(
     """Where a frame warped along `motion` shows another surface than the target.
 
     stencil: the warped stencil is not the target's. normal: the cosine of the normals is below `normal_threshold`, on
-    what the stencils do not both call static (everywhere, without stencils), and not where both are the sky. position:
-    the positions are farther apart than a threshold, where the stencils are both static. outside: p + motion[p] is
-    beyond the frame. Each mask needs its buffer in both G-buffers, and is `None` without.
+    what the stencils do not both call static (everywhere, without stencils), and not where both show nothing. position:
+    the positions are farther apart than a threshold, where the stencils are both static. depth: one shows a surface and
+    the other nothing (the sky's mask is above 0.5, or depth is infinite or not positive); positions are then infinitely
+    far apart. outside: p + motion[p] is beyond the frame. Each mask needs its buffer in both G-buffers ("depth" either
+    the sky or the depth), and is `None` without.
 
     Args:
         target, source: the G-buffers of the frame to be made and of the one that is warped.
@@ -189,7 +227,7 @@ def hole_masks(
             itself has no holes; ids are compared, not their mean. "nearest" looks at the nearest pixel alone: the
             pixels beside a silhouette, of whose taps one is wrong, are then no holes. "release" does as the authors':
             the bilinear mean of the ids, more than 1/3 off; the largest distance over all four taps; everything
-            outside is a hole of position as well.
+            outside is a hole of position as well; it has no mask of depth.
         softness: 0 gives bool masks. Above 0 they are in 0..1 and differentiable: a sigmoid of the excess over the
             threshold, relative to it, over softness; the stencil's is the weight of the taps with another id.
         normal_threshold: T_n, a cosine.
@@ -202,10 +240,12 @@ def hole_masks(
         `HoleMasks` of `[H, W, 1]`.
 
     Edge cases:
-        Motion that is not finite is outside. A position that is not finite is a hole.
+        Motion that is not finite is outside. A position that is not finite is a hole, but where both show nothing. A
+        NaN depth is a surface's.
 
     Gradient:
-        Only of soft masks: with respect to motion, normals, positions, thresholds and softness; not to ids.
+        Only of soft masks: with respect to motion, normals, positions, thresholds and softness; not to ids, depth and
+        sky.
 
     Raises:
         TypeError, ValueError: no floating-point array, a size that differs, an unknown `taps`.

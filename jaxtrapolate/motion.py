@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_array, check_choice, check_image
+from jaxtrapolate.depth import surface_depth
 from jaxtrapolate.gather import backward_warp, landing, take_rows
 from jaxtrapolate.records import Camera, check_camera
 from jaxtrapolate.scatter import splat_nearest
@@ -163,7 +164,8 @@ def occlusion_motion(motion: Float[Array, "h w 2"], depth: Float[Array, "h w 1"]
     its own motion lands, floored and held to the frame.
 
     Args:
-        motion: `[H, W, 2]` from the target to the source frame. depth: `[H, W, 1]` of the target.
+        motion: `[H, W, 2]` from the target to the source frame. depth: `[H, W, 1]` of the target; what is not positive
+            is nothing, and behind all surfaces.
 
     Returns:
         `[H, W, 2]`; 0 where nothing was splatted to. A pixel that is nobody's background gets its own or a like vector.
@@ -207,7 +209,7 @@ def dilate_motion(
     The silhouettes of moving objects then carry their antialiased edge along.
 
     Args:
-        motion: `[H, W, 2]`. depth: `[H, W, 1]`, smaller is nearer.
+        motion: `[H, W, 2]`. depth: `[H, W, 1]`, smaller is nearer; what is not positive is nothing, and far.
         neighbours: "diagonal" (four, as Unreal's engine pass), "cross" (four) or "square" (eight).
 
     Returns:
@@ -227,7 +229,7 @@ def dilate_motion(
     check_image("depth", depth, size=size, channels=1)
     check_choice("neighbours", neighbours, tuple(_NEIGHBOURS))
     height, width = size
-    depth = jax.lax.stop_gradient(depth)
+    depth = surface_depth(jax.lax.stop_gradient(depth))
     nearest = jnp.where(jnp.isnan(depth), jnp.inf, depth)
     around_depth = jnp.pad(nearest, ((1, 1), (1, 1), (0, 0)), constant_values=jnp.inf)
     around = jnp.pad(motion, ((1, 1), (1, 1), (0, 0)))

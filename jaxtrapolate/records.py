@@ -50,11 +50,11 @@ class Camera:
 class GBuffer:
     """The geometry and material buffers of a frame. All floating point, `[H, W, 3]` or `[H, W, 1]`.
 
-    albedo `[H, W, 3]`: base colour in 0..1. depth: distance along the view axis, in the unit of position. normal
-    `[H, W, 3]`: unit, world space, 0 at the sky. position `[H, W, 3]`: world space. roughness, metallic, specular in
-    0..1. n_dot_v: cosine between normal and direction to the eye. stencil: 0 static, > 0 the id of a dynamic object.
-    shadow: fraction of light that dynamic objects block, 1 = full shadow. sky: 1 where no surface was hit. sky_color
-    `[H, W, 3]`: radiance of the sky, where the engine draws it apart.
+    albedo `[H, W, 3]`: base colour in 0..1. depth: distance along the view axis, in the unit of position; +inf, or not
+    positive, where no surface was hit. normal `[H, W, 3]`: unit, world space, 0 at the sky. position `[H, W, 3]`: world
+    space. roughness, metallic, specular in 0..1. n_dot_v: cosine between normal and direction to the eye. stencil: 0
+    static, > 0 the id of a dynamic object. shadow: fraction of light that dynamic objects block, 1 = full shadow. sky:
+    1 where no surface was hit. sky_color `[H, W, 3]`: radiance of the sky, where the engine draws it apart.
     """
 
     albedo: Float[Array, "h w 3"] | None = None

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_present
+from jaxtrapolate.depth import surface_depth
 from jaxtrapolate.gather import landing, take_rows, weigh
 from jaxtrapolate.precision import widest
 
@@ -23,9 +24,8 @@ _NONE = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
 def _order(depth: Array) -> Array:
-    """float32 depth as unsigned integers of the same order."""
-    bits = jax.lax.bitcast_convert_type(depth + 0.0, jnp.uint32)  # the sum turns -0 into 0
-    return jnp.where(bits >> 31 == 1, ~bits, bits | jnp.uint32(0x80000000))
+    """Positive float32 depth as unsigned integers of the same order."""
+    return jax.lax.bitcast_convert_type(depth, jnp.uint32)
 
 
 @partial(jax.jit, static_argnames=("footprint",))
@@ -39,7 +39,7 @@ def splat_source(
     height, width = check_image("motion", motion, channels=2)
     check_image("depth", depth, size=(height, width), channels=1)
     x, y, used = landing(jax.lax.stop_gradient(motion))
-    depth = jax.lax.stop_gradient(depth[..., 0]).astype(jnp.float32)
+    depth = surface_depth(jax.lax.stop_gradient(depth)).astype(jnp.float32)[..., 0]
     # The minimum commutes with dilation: scatter once, to the cell of four pixel centres that the point lands in, then
     # let each pixel take the minimum of the four cells around it. Cell (j, i) has pixel (j, i) at its lower right.
     grow = 0 if footprint == 1 else 1
@@ -80,8 +80,8 @@ def splat_nearest(
 
     Args:
         values: `[H, W, C]`, what is scattered.
-        motion: `[H, W, 2]` in pixels. depth: `[H, W, 1]`, smaller is nearer; negative and infinite depths are ordered
-            like any other.
+        motion: `[H, W, 2]` in pixels. depth: `[H, W, 1]`, smaller is nearer; what is not positive is nothing, and as
+            far as +inf (`jaxtrapolate.depth`).
         footprint: 4, the four pixel centres around the landing place (a point that lands on a centre also covers the
             next ones right and down, as a cell of pixels does), or 1, the nearest centre (ties right and down).
 

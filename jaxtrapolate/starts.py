@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import ArrayLike, check_image
+from jaxtrapolate.depth import surface_depth
 from jaxtrapolate.precision import widest
 from jaxtrapolate.search import check_flow, check_scalar, only_finite, pair, plane, positions, scaled
 from jaxtrapolate.strips import by_strips, rows_of
@@ -100,8 +101,8 @@ def latest_start(
     Args:
         offset: `[H, W, 2]`, p - position of the search in the same I-frame for the frame made last.
         ratio: alpha / alpha' in the I-frame before, (1 - alpha) / (1 - alpha') in the one after; alpha' of that frame.
-        depth: `[H, W, 1]` that the points had in that frame, smaller is nearer; infinite or NaN where the search missed
-            and should not be followed. Without it each pixel keeps its own offset.
+        depth: `[H, W, 1]` that the points had in that frame, smaller is nearer; infinite, not positive or NaN where the
+            search missed, or nothing is, which should not be followed. Without it each pixel keeps its own offset.
         reach: the neighbourhood is a square of 2 reach + 1 pixels; 0 = the pixel itself.
 
     Returns:
@@ -121,5 +122,6 @@ def latest_start(
     wide = widest(offset)
     if depth is not None:
         check_image("depth", depth, size=(height, width), channels=1)
+        depth = surface_depth(jnp.asarray(depth))
     sources = LatestOffsets(jnp.asarray(offset).astype(wide), depth, jnp.asarray(ratio).astype(wide))
     return pair(by_strips(partial(latest, reach=reach), height, sources))

@@ -112,8 +112,14 @@ def shift(image, dx, dy, fill=None):
     return out
 
 
+def far(depth):
+    """Nothing, which is where a depth is not positive, at infinity."""
+    return np.where(depth <= 0, np.inf, depth)
+
+
 def splat_nearest(values, motion, depth, footprint=4):
     height, width, _ = values.shape
+    depth = far(depth)
     out, covered = np.zeros_like(values), np.zeros((height, width), bool)
     nearest = np.full((height, width), np.inf)
     for r, c, x, y, finite in places(motion):
@@ -214,7 +220,7 @@ def occlusion_motion(motion, depth):
 
 def dilate_motion(motion, depth, offsets):
     height, width, _ = motion.shape
-    out = motion.copy()
+    out, depth = motion.copy(), far(depth)
     for r, c in np.ndindex(height, width):
         nearest = np.inf if np.isnan(depth[r, c, 0]) else depth[r, c, 0]
         for j, i in offsets:

@@ -59,21 +59,23 @@ def taps(x, y):
             yield j, i, weight
 
 
-def spacing(position):
-    """The distance to the nearer of the neighbours along an axis, the larger of both axes."""
+def spacing(position, sky):
+    """The distance to the nearer of the neighbours along an axis that show a surface, the larger of both axes."""
     out = np.zeros(SIZE)
     for r, c in np.ndindex(SIZE):
         for step in ((1, 0), (0, 1)):
             ways = [(r + s * step[0], c + s * step[1]) for s in (-1, 1)]
             ways = [w for w in ways if 0 <= w[0] < SIZE[0] and 0 <= w[1] < SIZE[1]]
-            out[r, c] = max(out[r, c], min(np.linalg.norm(np.float64(position[w]) - position[r, c]) for w in ways))
+            ways = [w for w in ways if not sky[w] and not sky[r, c]]
+            distances = [np.linalg.norm(np.float64(position[w]) - position[r, c]) for w in ways]
+            out[r, c] = max(out[r, c], min(distances, default=0))
     return out
 
 
 def expected_masks(target, source, motion, threshold=2.0, normal_threshold=0.98):
     """The masks of taps="weighted" as the docstring states them."""
-    out = {name: np.zeros((*SIZE, 1), bool) for name in ("stencil", "normal", "position", "outside")}
-    seen, around = oracles.in_frame(motion), spacing(target["position"])
+    out = {name: np.zeros((*SIZE, 1), bool) for name in ("stencil", "normal", "position", "depth", "outside")}
+    seen, around = oracles.in_frame(motion), spacing(target["position"], target["sky"][..., 0] > 0.5)
     for r, c, x, y, _ in oracles.places(motion):
         out["outside"][r, c] = not seen[r, c]
         if not seen[r, c]:
@@ -83,6 +85,8 @@ def expected_masks(target, source, motion, threshold=2.0, normal_threshold=0.98)
         here = round(float(target["stencil"][r, c, 0]))
         out["stencil"][r, c] = any(i != here for i in ids)
         static = here == 0 and not any(ids)
+        sky, skies = target["sky"][r, c, 0] > 0.5, [source["sky"][j, i, 0] > 0.5 for j, i, _ in around_it]
+        out["depth"][r, c] = any(there != sky for there in skies)
         a, b = np.float64(target["normal"][r, c]), sum(w * np.float64(source["normal"][j, i]) for j, i, w in around_it)
         if not static and (a.any() or b.any()):
             cosine = a @ b / np.linalg.norm(a) / np.linalg.norm(b) if a.any() and b.any() else 0
@@ -92,12 +96,9 @@ def expected_masks(target, source, motion, threshold=2.0, normal_threshold=0.98)
             limit = threshold[0] * facing + threshold[1] * (1 - facing) + threshold[2] * target["depth"][r, c, 0]
         else:
             limit = threshold * around[r, c] + 1e-3 * target["depth"][r, c, 0]
-        far = max(
-            np.linalg.norm(np.float64(source["position"][j, i]) - target["position"][r, c]) for j, i, _ in around_it
-        )
-        nearest = min(int(np.floor(y + 0.5)), SIZE[0] - 1), min(int(np.floor(x + 0.5)), SIZE[1] - 1)
-        both_sky = target["sky"][r, c, 0] > 0.5 and source["sky"][tuple(max(k, 0) for k in nearest)][0] > 0.5
-        out["position"][r, c] = static and not both_sky and far > limit
+        far = [np.linalg.norm(np.float64(source["position"][j, i]) - target["position"][r, c]) for j, i, _ in around_it]
+        beyond = any(there != sky or (not sky and d > limit) for there, d in zip(skies, far, strict=True))
+        out["position"][r, c] = static and beyond
     return out
 
 
@@ -110,7 +111,7 @@ def test_weighted_against_the_loop(threshold):
         for name, expected in expected_masks(target, source, motion, threshold).items():
             assert getattr(masks, name).dtype == bool
             np.testing.assert_array_equal(getattr(masks, name), expected, err_msg=name)
-        union = np.logical_or.reduce([masks.stencil, masks.normal, masks.position, masks.outside])
+        union = np.logical_or.reduce([masks.stencil, masks.normal, masks.position, masks.depth, masks.outside])
         np.testing.assert_array_equal(masks.any, union)
 
 
@@ -118,7 +119,7 @@ def test_weighted_against_the_loop(threshold):
 def test_a_frame_onto_itself_has_no_holes(size):
     values = {name: value[: size[0], : size[1]] for name, value in buffers(1).items()}
     masks = hole_masks(gbuffer(values), gbuffer(values), jnp.zeros((*size, 2)))
-    for name in ("stencil", "normal", "position", "outside"):
+    for name in ("stencil", "normal", "position", "depth", "outside"):
         assert not getattr(masks, name).any(), name
 
 
@@ -203,13 +204,13 @@ def test_nearest_is_weighted_at_the_rounded_landing_place():
     near = hole_masks(gbuffer(target), gbuffer(source), jnp.asarray(motion), taps="nearest")
     exact = hole_masks(gbuffer(target), gbuffer(source), jnp.asarray(rounded, jnp.float32))
     inside = ~np.asarray(near.outside) & ~np.asarray(exact.outside)
-    for name in ("stencil", "normal", "position"):
+    for name in ("stencil", "normal", "position", "depth"):
         np.testing.assert_array_equal(
             np.asarray(getattr(near, name))[inside], np.asarray(getattr(exact, name))[inside], err_msg=name
         )
 
 
-NAMES = ("stencil", "normal", "position", "outside")
+NAMES = ("stencil", "normal", "position", "depth", "outside")
 
 
 @functools.cache
@@ -246,7 +247,7 @@ def test_soft_masks_become_hard(x64):
         assert value.dtype == np.float64
         assert value.min() >= 0
         assert value.max() <= 1
-        if name == "stencil":  # the weight of the taps with another id
+        if name in ("stencil", "depth"):  # the weight of the taps with another id, or of nothing
             np.testing.assert_array_equal(value > 0, expected)
         else:
             np.testing.assert_allclose(value, expected, atol=1e-3, err_msg=name)

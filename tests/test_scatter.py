@@ -67,19 +67,23 @@ def test_ties_go_to_the_lower_source(footprint):
     motion = np.stack([3 - x, 2 - y], -1).astype(np.float32)  # all land on one pixel
     depth = np.full((5, 7, 1), 0.5, np.float32)
     depth[0, 0] = 0.75
-    depth[3, 3:5] = -0.0
-    depth[3, 5] = 0.0
+    depth[3, 3:6] = 0.25
     result, covered = splat_nearest(values, motion, depth, footprint=footprint)
     assert covered.sum() == footprint
     assert result[2, 3, 0] == values[3, 3, 0]
 
 
 def test_depths_of_any_kind_are_ordered():
+    """What is not positive is nothing, as far as infinity: of those the lower source is taken, behind any surface."""
     values = np.arange(1, 36, dtype=np.float32).reshape(5, 7, 1).repeat(2, -1)
     y, x = np.mgrid[:5, :7]
     motion = np.stack([3 - x, 2 - y], -1).astype(np.float32)
     depth = np.full((5, 7, 1), np.nan, np.float32)
-    falling = [np.inf, 3e38, 2.0, 1e-30, 0.0, -1e-30, -2.0, -np.inf]
+    for k, value in enumerate([0.0, -0.0, -1e-30, -2.0, -np.inf, np.inf]):
+        depth.flat[29 - k] = value
+        result, _ = splat_nearest(values, motion, depth, footprint=1)
+        assert result[2, 3, 0] == values.reshape(-1, 2)[29 - k, 0]
+    falling = [np.inf, 3e38, 2.0, 1e-30]
     for k, value in enumerate(falling):
         depth.flat[k + 5] = value
         result, _ = splat_nearest(values, motion, depth, footprint=1)

@@ -373,7 +373,7 @@ def test_dual_start_finds_an_object_past_its_silhouette():
 def latest_loop(offset, depth, ratio, reach):
     """The offset of the smallest depth in the square; first along the row, then along the column, own pixel first."""
     height, width, _ = offset.shape
-    out = np.zeros(offset.shape)
+    out, depth = np.zeros(offset.shape), oracles.far(depth)
     order = [0, *(k for k in range(-reach, reach + 1) if k != 0)]
     for r, c in np.ndindex(height, width):
         best, chosen = np.inf, offset[r, c]

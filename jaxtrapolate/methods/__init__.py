@@ -15,6 +15,7 @@ from jaxtrapolate.methods import (
 )
 from jaxtrapolate.methods.method import Method as Method
 from jaxtrapolate.methods.method import Stage as Stage
+from jaxtrapolate.methods.method import neighbours as neighbours
 from jaxtrapolate.weights import default_weights
 
 _METHODS: dict[str, Callable[[], Method]] = {

@@ -51,7 +51,10 @@ def _between(state, values: Values):
     return {"between": chain(frames, len(history) + len(drawn) + upcoming(future)[0], rendered(history)[0])}
 
 
-BETWEEN = Stage("motion between", _between, reads=("future.motion",))
+CHAINED = ("future.motion", "before_next.motion", "since_newest.motion")
+"""Where motion leads from the next rendered frame to the previous one; through the target where that has any."""
+
+BETWEEN = Stage("motion between", _between, reads=CHAINED)
 """Chains the motion from the next rendered frame to the previous one, through all that was drawn between them."""
 
 
@@ -67,5 +70,5 @@ def _flows(state, values: Values):
     return {"forward": flows.previous.forward_flow, "backward": values["between"]}
 
 
-FLOWS = Stage("flows", _flows, reads=("future.motion",))
+FLOWS = Stage("flows", _flows, reads=CHAINED)
 """Both flows: the backward one is the chained motion, the forward one is made from it (`complete_flows`)."""

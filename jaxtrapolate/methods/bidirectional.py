@@ -13,12 +13,14 @@ from jaxtyping import Array
 from jaxtrapolate.assisted import DepthKind
 from jaxtrapolate.bidirectional import interpolate_bidirectional
 from jaxtrapolate.checks import check_present
+from jaxtrapolate.depth import apart as depth_apart
+from jaxtrapolate.depth import held
 from jaxtrapolate.flows import complete_flows
 from jaxtrapolate.gather import backward_warp, in_frame, pixel_grid, sample
-from jaxtrapolate.methods.between import BETWEEN, PAIR, depth_of
+from jaxtrapolate.methods.between import BETWEEN, CHAINED, PAIR, depth_of
 from jaxtrapolate.methods.method import Method, Stage, Values, rendered, upcoming
 from jaxtrapolate.methods.stages import SKY, chain, find_holes
-from jaxtrapolate.methods.warping import fetch_guided
+from jaxtrapolate.methods.warping import fetch_guided, guides_of
 from jaxtrapolate.motion import camera_motion
 from jaxtrapolate.precision import widest
 from jaxtrapolate.radiance import By, compress, demodulate, expand, modulate
@@ -49,7 +51,7 @@ def _search(state, values: Values):
     return {"image": jnp.where(made == first.color, jnp.asarray(previous.color), expand(made))}
 
 
-SEARCH = Stage("search", _search, reads=("future.motion",))
+SEARCH = Stage("search", _search, reads=CHAINED)
 """Searches for each pixel's point in both frames, along their flows (5.1-5.3); what stands still stays bit for bit.
 
 Departure: colours are fetched and blended after `compress`, not as linear light, see `mix`.
@@ -93,7 +95,7 @@ def _reproject(state, values: Values):
     return {"to_previous": to_previous, "to_next": to_next, "seen": (seen_previous, seen_next)}
 
 
-REPROJECT_BOTH = Stage("reproject to both", _reproject, reads=("target.motion", "future.motion", "target.depth"))
+REPROJECT_BOTH = Stage("reproject to both", _reproject, reads=("target.motion", *CHAINED, "target.depth"))
 """The motion from the target to both rendered frames, and where its points are visible there.
 
 To the frame after it is that of the cameras where those are known and the surface is static, else the next frame's
@@ -130,24 +132,26 @@ def _weight(values: Values) -> Array:
         check_present(f"{name}.depth", depth_of(values[name]), needed_by="the blend")
         for name in ("target", "previous", "next")
     )
-    apart = [jnp.abs(backward_warp(there, motion) - depth) for there, motion in zip(depths, at, strict=True)]
+    apart = [depth_apart(backward_warp(held(there), motion), depth) for there, motion in zip(depths, at, strict=True)]
     likelier = jnp.where(inside[0] == inside[1], apart[1] < apart[0], inside[1])
     one = jnp.where(in_first == in_second, likelier, in_second)
     return jnp.where(in_first & in_second, values["alpha"], one.astype(values["alpha"].dtype))
+
+
+_BOTH = (*REPROJECT_BOTH.reads, "history.depth", "future.depth")
+"""What the blend of both frames by their depth takes."""
 
 
 def fetch_stage(by: By) -> Stage:
     """Fetches both frames along the motion, bilinearly."""
 
     def function(state, values: Values):
-        if "seen" not in values:
-            return {}
         by_ = _demodulates(values, by)
         pairs = (("previous", "to_previous"), ("next", "to_next"))
         fetched = tuple(backward_warp(_layers(values[name], by_), values[motion]) for name, motion in pairs)
         return {"fetched": fetched, "weight": _weight(values), "both": values["seen"][0] & values["seen"][1]}
 
-    return Stage("fetch", function, reads=("history.depth", "future.depth"), optional=True)
+    return Stage("fetch", function, reads=_BOTH, optional=True)
 
 
 def guided_fetch_stage(by: By) -> Stage:
@@ -168,14 +172,10 @@ def guided_fetch_stage(by: By) -> Stage:
         weight = jnp.where(inside[0] == inside[1], values["alpha"], one)
         return {"fetched": tuple(fetched), "weight": weight, "both": inside[0] & inside[1]}
 
-    roles, names = ("target", "history", "future"), ("albedo", "normal", "stencil")
-    reads = tuple("|".join(f"{role}.{name}" for name in names) for role in roles)
-    return Stage("guided fetch", function, reads=reads)
+    return Stage("guided fetch", function, reads=(guides_of("history"), guides_of("future")))
 
 
 def _blend(state, values: Values):
-    if "fetched" not in values:
-        return {}
     first, second = (layers[..., -3:] for layers in values["fetched"])
     return {"image": mix(first, second, values["weight"])}
 
@@ -199,17 +199,19 @@ def _apart(first: Array, second: Array, both: Array) -> Array:
     return _blocks(jnp.where(both, jnp.square(compress(first) - compress(second)), 0)) ** 2
 
 
-def relight_stage(by: By) -> Stage:
+def relight_stage(by: By, *, reads: tuple[str, ...] = ()) -> Stage:
     """Blends light instead of colour: over each frame's reflectance, times the target's.
 
     Where light is not reflectance times irradiance (emission, fog) that prints a texture which is not there. There the
     two frames agree better as they are: blocks of 8 x 8 pixels take the colour as it is by how much better it agrees,
     and so do pixels that stand still.
+
+    Args:
+        by: as of `demodulate`.
+        reads: of the stages before it, where those are optional.
     """
 
     def function(state, values: Values):
-        if "fetched" not in values:
-            return {}
         (first, second), weight, both = values["fetched"], values["weight"], values["both"]
         light = [modulate(layers[..., :3], values["target"].gbuffer, by=by) for layers in (first, second)]
         a, b = _apart(first[..., 3:], second[..., 3:], both) * _MARGIN**2, _apart(light[0], light[1], both)
@@ -224,12 +226,15 @@ def relight_stage(by: By) -> Stage:
         relit = jnp.where(stands, 0, relit)
         return {"image": mix(values["image"], mix(light[0], light[1], weight), relit)}
 
-    return Stage("relight", function, reads=("history.albedo", "target.albedo", "future.albedo"), optional=True)
+    reads = (*reads, "history.albedo", "target.albedo", "future.albedo")
+    return Stage("relight", function, reads=reads, optional=True)
 
 
 def bidirectional(*, by: By = "albedo+specular") -> Method:
     """Both rendered frames around the target, by the target's own motion and buffers where those were drawn."""
-    stages = (PAIR, BETWEEN, _optional(REPROJECT_BOTH), fetch_stage(by), BLEND, relight_stage(by), SEARCH, SKY)
+    blend = dataclasses.replace(BLEND, reads=_BOTH, optional=True)
+    both = (_optional(REPROJECT_BOTH), fetch_stage(by), blend, relight_stage(by, reads=_BOTH))
+    stages = (PAIR, BETWEEN, *both, SEARCH, SKY)
     return Method("bidirectional", stages, kind="interpolation", past=1, future=1)
 
 

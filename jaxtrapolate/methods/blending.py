@@ -49,13 +49,14 @@ def half_motion() -> Method:
 
 
 def _nearness(depth: Array) -> Float[Array, "h w 1"]:
-    """Exponents by depth of any unit: -100 depth / (depth + its mean over the frame); NaN counts as farthest."""
-    finite = jnp.isfinite(depth)
-    mean = jnp.sum(jnp.where(finite, jnp.abs(depth), 0)) / jnp.maximum(jnp.sum(finite, dtype=depth.dtype), 1)
-    scale = jnp.where(mean > 0, mean, 1).astype(depth.dtype)
-    held = jnp.where(finite, depth, 0)
-    squashed = held / (jnp.abs(held) + scale)
-    return -_BY_DEPTH * jnp.where(finite, squashed, jnp.where(depth == -jnp.inf, -1, 1))
+    """Exponents by depth of any unit: -5 depth / (depth + its harmonic mean over the frame); -5 where nothing is.
+
+    In that mean what is far hardly counts, and nothing counts as the limit of that. NaN counts as nothing.
+    """
+    known = depth < jnp.inf
+    inverse = jnp.where(known, 1 / jnp.where(known, depth, 1), 0)
+    mean = jnp.mean(inverse)
+    return -_BY_DEPTH * jnp.where(mean > 0, mean / jnp.where(mean > 0, inverse + mean, 1), 1)
 
 
 def _likeness(own: Array, other: Array, flow: Array) -> Float[Array, "h w 1"]:

@@ -16,6 +16,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_choice
+from jaxtrapolate.depth import surface_depth
 from jaxtrapolate.files.sequence import printable
 from jaxtrapolate.gather import backward_warp
 from jaxtrapolate.holes import Taps
@@ -116,8 +117,11 @@ def relative_depth(depth: Float[Array, "h w 1"], sky: Float[Array, "h w 1"] | No
 
 
 def minmax_depth(depth: Float[Array, "h w 1"]) -> Float[Array, "h w 1"]:
-    """The release's depth: in units of 100 m, 0 where over 100 of them, then (d - min) / (max - min + 1e-6)."""
-    hundreds = depth * 1e-4
+    """The release's depth: in units of 100 m, 0 where over 100 of them, then (d - min) / (max - min + 1e-6).
+
+    Depth that is not positive, or NaN, counts as over 100.
+    """
+    hundreds = surface_depth(depth) * 1e-4
     known = hundreds <= 100
     hundreds = jnp.where(known, hundreds, 0)
     low, high = jnp.min(hundreds), jnp.max(hundreds)

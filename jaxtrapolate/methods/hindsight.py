@@ -70,6 +70,5 @@ def hindsight_stage(by: By = "albedo+specular") -> Stage:
         x, y, _ = landing(motion)
         return {"plain_share": sample(share, (x + 0.5) / _BLOCK - 0.5, (y + 0.5) / _BLOCK - 0.5)}
 
-    return Stage(
-        "hindsight", function, reads=("history.albedo", "target.albedo", "history.motion"), optional=True, past=2
-    )
+    reads = ("history.albedo", "target.albedo", "newest.motion", "before_newest.motion")
+    return Stage("hindsight", function, reads=reads, optional=True, past=2)

@@ -2,14 +2,14 @@
 
 The run, the benchmark, the plan and the reports all read that one list. A stage is a pure function of the method's
 state (its weights) and of the values so far, a dict; it returns the values that it adds. A method starts with "carry",
-"history", "target" and "future", and ends with "image". A stage on the host (a library that is not JAX) is run between
-the compiled ones around it.
+"history", "target" and "future", frames whose depth is +inf where no surface was hit, and ends with "image". A stage on
+the host (a library that is not JAX) is run between the compiled ones around it.
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import Any, Literal
 
 import jax
@@ -18,6 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import missing_package
+from jaxtrapolate.depth import surfaces
 from jaxtrapolate.records import Frame, check_frame
 
 Values = Mapping[str, Any]
@@ -31,8 +32,11 @@ class Stage:
     Attributes:
         name: what reports call it.
         function: `(state, values) -> values to add`.
-        reads: the buffers that it needs, as "target.depth" or "history.albedo" (in every rendered frame that the method
-            takes); alternatives are separated by "|".
+        reads: the buffers that it needs, as "target.depth"; "target+newest.normal" is needed in both, and alternatives
+            are separated by "|". Frames are named "target"; "history" and "future", every rendered frame that the
+            method takes; "newest", the newest of history; and what was not rendered, every frame if there is any, which
+            motion chains through: "since_newest", in history after the newest rendered frame, "before_newest", between
+            that and the rendered one before it, and "before_next", in future before the next rendered frame.
         optional: whether the method does without it: left out where a buffer is missing. Without a stage that is not
             optional the method cannot run.
         past: how many rendered frames it needs.
@@ -66,6 +70,58 @@ def upcoming(future: Sequence[Frame]) -> list[int]:
     return [i for i, frame in enumerate(future) if frame.color is not None]
 
 
+def neighbours(
+    colored: Sequence[bool],
+    place: int,
+    *,
+    past: int = 1,
+    future: int = 0,
+    numbers: Sequence[int | float] | None = None,
+) -> tuple[range, range]:
+    """Which frames of a sequence a method is to be handed as history and future, for the frame at `place`.
+
+    Back to the `past`-th rendered frame before it and on to the `future`-th after it, all frames between included, so
+    that motion chains through those without colour; what is beyond the last rendered frame is left out. Where `numbers`
+    step over frames nothing on the other side is taken: no motion leads across.
+
+    Args:
+        colored: of each frame whether it has colour.
+        place: of the frame to be made, an index into `colored`.
+        past, future: how many rendered frames, as the `Method` wants.
+        numbers: of the frames (or their times), ascending by one per frame; `None` where none is missing.
+
+    Returns:
+        Two ranges of indices: `history = [frames[i] for i in first]`. Empty where there is no rendered frame; shorter
+        where there are fewer.
+
+    Raises:
+        ValueError: `place` is no index, or numbers of another length or that do not ascend.
+    """
+    count = len(colored)
+    if not 0 <= place < count:
+        raise ValueError(f"place: expected 0 to {count - 1}, got {place}")
+    numbers = range(count) if numbers is None else numbers
+    if len(numbers) != count:
+        raise ValueError(f"numbers: expected {count} as there are frames, got {len(numbers)}")
+    steps = [later - earlier for earlier, later in pairwise(numbers)]
+    if any(step <= 0 for step in steps):
+        raise ValueError(f"numbers: expected each above the one before, got {list(numbers)}")
+
+    def last(places: range, wanted: int) -> int | None:
+        """The place of the `wanted`-th rendered frame, or of the last before a gap."""
+        found = None
+        for i in places:
+            step = steps[i] if i < place else steps[i - 1]
+            if wanted == 0 or step > 1:
+                break
+            if colored[i]:
+                found, wanted = i, wanted - 1
+        return found
+
+    first, final = last(range(place - 1, -1, -1), past), last(range(place + 1, count), future)
+    return range(place if first is None else first, place), range(place + 1, place + 1 if final is None else final + 1)
+
+
 def _run(stages: Sequence[Stage], state: Any, values: Values) -> dict[str, Any]:
     """What some stages add to the values, one after the other."""
     added: dict[str, Any] = {}
@@ -81,6 +137,13 @@ class Method:
     history and future are tuples of `Frame` in order of display, oldest first; a frame may lack colour (only its
     buffers were drawn): motion chains through it. target is the `Frame` to be made: its time, and whatever buffers were
     drawn for it. A target that has colour was rendered, and is returned as it is by methods that do not super sample.
+
+    No frame may be left out between those handed over: each one's motion leads to the one before it here, also from
+    future[0] to the target (to history[-1] where the target has no motion), and from the target to history[-1]. Of a
+    sequence whose motion leads from frame to frame, that is every frame from the oldest to the newest that is taken,
+    with colour or without; `neighbours` says which. That cannot be checked here: times are traced, and need not be
+    there. What a frame shows of nothing (depth that is not positive or infinite, or the sky) is far in every stage, see
+    `jaxtrapolate.depth`.
 
     Attributes:
         name: as `jaxtrapolate.load` knows it.
@@ -128,14 +191,26 @@ class Method:
         if stage.extra is not None and (lacking := missing_package(stage.extra)):
             lacks.append(lacking)
         following = [future[i] for i in upcoming(future)][: self.future]
-        roles = {"target": [target], "history": sources, "future": following}
+        roles = {"target": [target], "history": sources, "future": following, "newest": sources[:1]}
+        newest, previous = (*rendered(history), -1, -1)[:2]
+        between = {
+            "since_newest": history[newest + 1 :],
+            "before_newest": history[previous + 1 : max(newest, 0)],
+            "before_next": future[: (*upcoming(future), len(future))[0]],
+        }
 
         def there(place: str) -> bool:
-            role, name = place.split(".")
-            frames = roles[role]
-            return bool(frames) and all(buffer(frame, name) is not None for frame in frames)
+            names, name = place.split(".")
+            frames = [frame for role in names.split("+") for frame in (*roles.get(role, ()), *between.get(role, ()))]
+            whole = all(roles[role] for role in names.split("+") if role in roles)
+            return whole and all(buffer(frame, name) is not None for frame in frames)
 
-        return lacks + [" or ".join(r.split("|")) for r in stage.reads if not any(map(there, r.split("|")))]
+        def said(place: str) -> str:
+            names, name = place.split(".")
+            return f"{name} in {' and '.join(names.split('+'))}" if "+" in names else place
+
+        missing = [r.split("|") for r in stage.reads if not any(map(there, r.split("|")))]
+        return lacks + [" or ".join(map(said, places)) for places in missing]
 
     def function(
         self, state: Any, carry: Any, history: Frames, target: Frame, future: Frames = ()
@@ -170,8 +245,13 @@ class Method:
             raise ValueError(f"method {self.name!r}: expected one of the stages {', '.join(names)}, got {stage!r}")
         return self._advance(stages[: names.index(stage)], state, carry, history, target, future)
 
+    def first_values(self, carry: Any, history: Frames, target: Frame, future: Frames = ()) -> dict[str, Any]:
+        """What the first stage gets: the frames, whose depth is +inf where no surface was hit (`surface_depth`)."""
+        history, future = (tuple(map(surfaces, frames)) for frames in (history, future))
+        return {"carry": carry, "history": history, "target": surfaces(target), "future": future}
+
     def _advance(self, stages, state, carry, history, target, future) -> dict[str, Any]:
-        values = {"carry": carry, "history": history, "target": target, "future": future}
+        values = self.first_values(carry, history, target, future)
         for stage in stages:
             if stage.host and any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state, values))):
                 raise TypeError(
@@ -186,7 +266,7 @@ class Method:
         self._check(history, target, future)
         if target.color is not None and self.scale == 1:
             return carry, jnp.asarray(target.color)
-        values: dict[str, Any] = {"carry": carry, "history": history, "target": target, "future": future}
+        values: dict[str, Any] = self._first_values(carry, history, target, future)
         for host, group in groupby(self.active(history, target, future), key=lambda stage: stage.host):
             row = tuple(group)
             values |= _run(row, self.state, values) if host else self._rows(row)(self.state, values)
@@ -211,6 +291,10 @@ class Method:
         check_frame("target", target, size=size)
         if not rendered(history):
             raise ValueError(f"history: expected a frame with colour, got {len(history)} frames without")
+
+    @cached_property
+    def _first_values(self):
+        return jax.jit(self.first_values)
 
     @cached_property
     def _jitted(self):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.assisted import agree
+from jaxtrapolate.depth import changed
 from jaxtrapolate.fill import fill_around
 from jaxtrapolate.flows import camera_flow
 from jaxtrapolate.gather import backward_warp, in_frame
@@ -50,7 +51,7 @@ def reprojection(shade: Shade | None = None) -> Method:
 
     def test(state, values: Values):
         motion, expected = values["motion"], values["target"].gbuffer.depth
-        expected = expected + values["change"] if "change" in values else expected
+        expected = changed(expected, values["change"]) if "change" in values else expected
         found = backward_warp(values["newest"].gbuffer.depth, motion, filter="nearest")
         return {"missed": ~(in_frame(motion) & agree(found, expected, jnp.asarray(_EPSILON), "metric")[..., 0])}
 
@@ -134,7 +135,7 @@ def carried_depth(values: Values) -> Array:
     if depth is None:
         return jnp.zeros_like(values["onward"][..., :1])
     deeper = values.get("deeper")
-    return depth if deeper is None else depth + jnp.where(jnp.isfinite(deeper), deeper, 0)
+    return depth if deeper is None else changed(depth, jnp.where(jnp.isfinite(deeper), deeper, 0))
 
 
 def warp_3d() -> Method:

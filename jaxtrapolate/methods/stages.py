@@ -50,7 +50,7 @@ def reproject_stage(past: int = 1) -> Stage:
             motions.append(motion)
         return {"newest": sources[0], "motion": motions[0], "sources": tuple(sources), "motions": tuple(motions)}
 
-    return Stage("reproject", function, reads=("target.motion", "history.color"))
+    return Stage("reproject", function, reads=("target.motion", "since_newest.motion", "history.color"))
 
 
 REPROJECT = reproject_stage()

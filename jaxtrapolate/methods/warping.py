@@ -67,6 +67,11 @@ def guides(target, source):
     return tuple(jnp.concatenate([getattr(g, n) for n in names], -1) for g in (target, source))
 
 
+def guides_of(role: str) -> str:
+    """What a stage reads that compares the target with the frames of a role by `guides`: one that both have."""
+    return "|".join(f"target+{role}.{name}" for name in (*_GUIDES, "stencil"))
+
+
 def fetch_guided(image, motion, holes, target, source, *, rows: int | None = ROWS):
     """The image by the guided warp along the motion; in holes as far off as in a frame of about `rows` rows.
 
@@ -88,8 +93,7 @@ def guided_stage(*, rows: int | None = ROWS) -> Stage:
         warped = fetch_guided(layers(values)[0], values["motion"], values["holes"], *frames, rows=rows)
         return {"warped": warped, "image": warped[..., :3]}
 
-    reads = tuple("|".join(f"{role}.{name}" for name in (*_GUIDES, "stencil")) for role in ("target", "history"))
-    return Stage("guided warp", function, reads=reads)
+    return Stage("guided warp", function, reads=(guides_of("newest"),))
 
 
 def guided(*, rows: int | None = ROWS) -> Method:
