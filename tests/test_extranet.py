@@ -35,36 +35,43 @@ def hole(target, source, r, c, x, y, inside, release):
         return True
     height, width, _ = target.depth.shape
     j, i = min(max(int(np.floor(y + 0.5)), 0), height - 1), min(max(int(np.floor(x + 0.5)), 0), width - 1)
-    if target.stencil[r, c, 0] != source.stencil[j, i, 0]:
+    nothing = target.sky[r, c, 0] > 0.5, source.sky[j, i, 0] > 0.5
+    if target.stencil[r, c, 0] != source.stencil[j, i, 0] or nothing[0] != nothing[1]:
         return True
+    if nothing[0]:
+        return False
     if target.stencil[r, c, 0] != 0:
         a, b = np.float64(target.normal[r, c]), np.float64(source.normal[j, i])
         if not a.any() and not b.any():
             return False
         return a @ b < 0.98 * np.linalg.norm(a) * np.linalg.norm(b) if a.any() and b.any() else True
-    if target.sky[r, c, 0] > 0.5 and source.sky[j, i, 0] > 0.5:
-        return False
     apart = np.linalg.norm(np.float64(target.position[r, c]) - np.float64(source.position[j, i]))
     if release:
         facing = abs(float(target.n_dot_v[r, c, 0]))
         limit = 7.5 * facing + 45 * (1 - facing) + 0.005 * float(target.depth[r, c, 0])
     else:
-        limit = 2 * footprint(target.position, r, c) + 1e-3 * float(target.depth[r, c, 0])
+        limit = 2 * footprint(target, r, c) + 1e-3 * float(target.depth[r, c, 0])
     return apart > limit
 
 
-def footprint(position, r, c):
-    steps = []
+def footprint(buffers, r, c):
+    position, sky, steps = buffers.position, buffers.sky[..., 0] > 0.5, []
     for axis, place in ((0, r), (1, c)):
         size = position.shape[axis]
         near = [n for n in (place - 1, place + 1) if 0 <= n < size]
-        others = [position[(n, c) if axis == 0 else (r, n)] for n in near]
+        others = [(n, c) if axis == 0 else (r, n) for n in near]
+        others = [position[at] for at in others if not sky[at]]
         steps.append(min((np.linalg.norm(np.float64(o) - position[r, c]) for o in others), default=0.0))
     return max(steps)
 
 
 def encode(image):
     return np.log1p(np.maximum(image, 0))
+
+
+def surface_depth(buffers):
+    """Under the sky's mask nothing is."""
+    return np.where(buffers.sky > 0.5, np.inf, np.float64(buffers.depth))
 
 
 def expected_inputs(history, target, release):
@@ -89,7 +96,7 @@ def expected_inputs(history, target, release):
         warped.append(encode(oracles.backward_warp(layer, motion, outside=outside)))
         valid.append(1.0 - holes)
         if first is None:
-            occluder = oracles.occlusion_motion(motion, np.float64(target.gbuffer.depth))
+            occluder = oracles.occlusion_motion(motion, surface_depth(target.gbuffer))
             composite = oracles.backward_warp(layer, np.where(holes, occluder, motion), outside=outside)
             first = np.concatenate([warped[0], encode(composite)], -1)
     normal = np.where(target.gbuffer.sky > 0.5, -1.0 if release else 0.0, np.float64(target.gbuffer.normal))
@@ -180,7 +187,7 @@ def test_the_sky_is_the_engines_or_the_warped_one(methods):
     assert 0.05 < sky.mean() < 0.5
     method = methods["release"]
     motion = np.float64(target.motion)
-    occluder = oracles.occlusion_motion(motion, np.float64(target.gbuffer.depth))
+    occluder = oracles.occlusion_motion(motion, surface_depth(target.gbuffer))
     holes = expected_inputs(history, target, True)["mask"] < 0.5
     plain = oracles.backward_warp(history[-1].color, np.where(holes, occluder, motion))
     np.testing.assert_allclose(image_of(method, history, target)[sky], plain[sky], rtol=1e-4, atol=1e-4)

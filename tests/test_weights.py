@@ -517,7 +517,7 @@ def test_default_weights(tmp_path, monkeypatch):
         weights.default_weights("extranet")
 
 
-def _npz(folder, members):
+def _npz_file(folder, members):
     """A file of weights with the right hash, whose members are these bytes."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
@@ -543,7 +543,7 @@ HEADERS = {
 
 @pytest.mark.parametrize("case", sorted(HEADERS))
 def test_damaged_headers_of_arrays(tmp_path, case):
-    path = _npz(tmp_path, {"a.npy": _array(HEADERS[case])})
+    path = _npz_file(tmp_path, {"a.npy": _array(HEADERS[case])})
     with pytest.raises(ValueError, match="no weights of this library") as error:
         weights.load_weights(path)
     assert str(error.value).startswith(str(path))
@@ -553,7 +553,7 @@ def test_damaged_headers_of_arrays(tmp_path, case):
 def test_nested_metadata(tmp_path):
     text = b'{"method": "a", "note": "", "config": ' + b'{"a":' * 100_000 + b"1" + b"}" * 100_000 + b"}"
     header = f"{{'descr': '|S{len(text)}', 'fortran_order': False, 'shape': ()}}\n".encode()
-    path = _npz(tmp_path, {"__metadata__.npy": _array(header) + text})
+    path = _npz_file(tmp_path, {"__metadata__.npy": _array(header) + text})
     with pytest.raises(ValueError, match="no weights of this library"):
         weights.load_weights(path)
 

@@ -24,7 +24,7 @@ from jaxtrapolate.commands.inputs import (
 from jaxtrapolate.files import InputError, Sequence, runs, write_frame
 from jaxtrapolate.files.reader import stored_size
 from jaxtrapolate.frame_forecast import forecast
-from jaxtrapolate.methods.method import Frames, Method, rendered
+from jaxtrapolate.methods.method import Frames, Method, neighbours, rendered
 from jaxtrapolate.output import open_output, write_json
 from jaxtrapolate.records import Frame, replace
 from jaxtrapolate.weights import fingerprint
@@ -155,35 +155,17 @@ def _run_of(sequence: Sequence, number: int) -> range:
     return next(r for r in runs(sequence) if number in r)
 
 
-def _before(sequence: Sequence, number: int, past: int) -> tuple[int, ...]:
-    """The frames before `number` without a gap, back to the `past`-th rendered one or the oldest there is."""
-    found: list[int] = []
-    count = 0
+def _around(sequence: Sequence, number: int, past: int, future: int = 0) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The frames before and after a frame that `neighbours` says, within its run."""
     run = _run_of(sequence, number)
-    for n in reversed(run[: run.index(number)]):
-        found.insert(0, n)
-        count += sequence.has_color(n)
-        if count == past:
-            break
-    while found and not sequence.has_color(found[0]):
-        found.pop(0)
-    return tuple(found)
+    colored = [sequence.has_color(n) for n in run]
+    before, behind = neighbours(colored, run.index(number), past=past, future=future)
+    return tuple(run[i] for i in before), tuple(run[i] for i in behind)
 
 
-def _behind(sequence: Sequence, number: int, future: int) -> tuple[int, ...]:
-    """The frames after `number` without a gap, up to the `future`-th rendered one; none where there are fewer.
-
-    All of them, those without colour too: motion vectors lead from frame to frame.
-    """
-    found: list[int] = []
-    count = 0
-    run = _run_of(sequence, number)
-    for n in run[run.index(number) + 1 :] if future else ():
-        found.append(n)
-        count += sequence.has_color(n)
-        if count == future:
-            return tuple(found)
-    return ()
+def _with_older(sequence: Sequence, number: int, past: int) -> tuple[int, ...]:
+    """A rendered frame, and those before it, up to `past` rendered ones in all."""
+    return (*_around(sequence, number, past - 1)[0], number) if past > 1 else (number,)
 
 
 def _frames(sequence: Sequence, numbers: tuple[int, ...]) -> Frames:
@@ -206,7 +188,7 @@ def _usable(method: Method, history: Frames, target: Frame, future: Frames = ())
 def _missing(sequence: Sequence, method: Method, numbers: list[int]) -> Iterator[Job]:
     """The frames that have buffers but no colour."""
     for number in numbers:
-        before, behind = _before(sequence, number, method.past), _behind(sequence, number, method.future)
+        before, behind = _around(sequence, number, method.past, method.future)
 
         def given(number=number, before=before, behind=behind):
             if method.future and not behind:
@@ -221,7 +203,7 @@ def _between(sequence: Sequence, method: Method, factor: int) -> Iterator[Job]:
     """factor - 1 frames between each two."""
     for run in runs(sequence):
         for number, following in itertools.pairwise(run):
-            before = (*_before(sequence, number, method.past - 1), number) if method.past > 1 else (number,)
+            before = _with_older(sequence, number, method.past)
             for k in range(1, factor):
 
                 def given(before=before, number=number, following=following, k=k):
@@ -236,7 +218,7 @@ def _between(sequence: Sequence, method: Method, factor: int) -> Iterator[Job]:
 def _onward(sequence: Sequence, method: Method, factor: int) -> Iterator[Job]:
     """factor - 1 frames after each, as if its motion went on."""
     for number in sequence.numbers:
-        before = (*_before(sequence, number, method.past - 1), number) if method.past > 1 else (number,)
+        before = _with_older(sequence, number, method.past)
         for k in range(1, factor):
 
             def given(before=before, number=number, k=k):

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import errno
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -32,6 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from jaxtrapolate.memory import keep_memory
 
     keep_memory()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names of files need not be text
     try:
         # only now: an exception in the middle of importing a C++ extension may crash the process
         with interrupt.interruptible():
@@ -63,10 +67,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _fail(text: str) -> int:
-    line = " ".join(text.split())
-    # a path need not be text in the terminal's encoding
-    encoding = sys.stderr.encoding or "utf-8"
-    print(f"jaxtrapolate: {line}".encode(encoding, "backslashreplace").decode(encoding), file=sys.stderr)
+    print(f"jaxtrapolate: {' '.join(text.split())}", file=sys.stderr)
     return 2
 
 
