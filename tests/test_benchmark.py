@@ -62,6 +62,7 @@ def test_all_operations_without_peers(operations, tmp_path, monkeypatch, capsys)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["results.json"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "module, names",
     [

@@ -347,6 +347,7 @@ def test_infinite_depth_is_the_sky():
 # Runs
 
 
+@pytest.mark.slow
 def test_a_run_is_the_frames_one_by_one():
     previous, next = moving()
     made = jx.interpolate_run(previous, next, factor=4)

@@ -27,6 +27,7 @@ def db(image, truth):
     return -10 * np.log10(np.mean(np.square(np.asarray(image, np.float64) - np.asarray(truth, np.float64))))
 
 
+@pytest.mark.slow
 def test_better_than_its_inputs(methods):
     scores = {}
     for name, method in methods.items():

@@ -70,6 +70,7 @@ def saved(model, tmp_path_factory):
     return weights.save_weights(folder, "extranet", nnx.to_pure_dict(nnx.state(model)), config=config, note="random")
 
 
+@pytest.mark.slow
 def test_weights_state_their_preparation(model, saved):
     history, target = make_window()
     method = jx.load("extranet", weights=saved)

@@ -99,6 +99,7 @@ def wide_hole(height=24, width=120):
     return frames, hole
 
 
+@pytest.mark.slow
 def test_a_hole_wider_than_the_kernels_is_filled_from_the_wall():
     (source, truth), hole = wide_hole()
     error = {}

@@ -338,6 +338,7 @@ def shapes_of(height, width):
     return (height, width, 6), (height, width, 1), (height, width, 2), (2, height, width, 4)
 
 
+@pytest.mark.slow
 def test_without_batch_norm_signals_keep_their_size():
     """And the first answer is about the first guess."""
     model = ExtraNet(ExtraNetConfig(norm=False), rngs=nnx.Rngs(0))

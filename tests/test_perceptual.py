@@ -128,6 +128,7 @@ def test_lpips_gradient(x64, net):
     np.testing.assert_allclose(found, (up - down) / 2e-7, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_lpips_in_transformations():
     weights, (first, second) = tiny("alex"), pair(31, 33)
     arrays = jnp.asarray(first), jnp.asarray(second)

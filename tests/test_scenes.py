@@ -317,6 +317,7 @@ def test_left_out_objects_are_gone_with_their_shadows(scene, frame):
     np.testing.assert_array_equal(np.asarray(none.gbuffer.depth)[before_them], frame.gbuffer.depth[before_them])
 
 
+@pytest.mark.slow
 def test_same_again_and_under_jit_and_vmap(scene, frame):
     again = render(scene, TIME, size=SIZE, previous_time=BEFORE)
     jax.tree.map(np.testing.assert_array_equal, again, frame)

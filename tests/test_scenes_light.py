@@ -32,6 +32,7 @@ def directions(frame, x, y):
     return -view[:3, :3].T @ view[:3, 3], local @ view[:3, :3]
 
 
+@pytest.mark.slow
 def test_a_mirror_shows_what_the_mirrored_ray_meets():
     centre, radius, glow = np.array([0.2, 0.3, 1.1]), 0.5, np.array([3.0, 2.0, 0.5])
     b = Builder()

@@ -437,12 +437,15 @@ def work(folder):
     assert main(["evaluate", str(dump), "--methods", "repeat,warp", "--output", str(folder / "results")]) == 0
 
 
-def test_a_process_with_all_settings(tmp_path):
+@pytest.mark.parametrize(
+    "before", ["", pytest.param("test_settings.draw(); ", marks=pytest.mark.slow)], ids=["", "draw"]
+)
+def test_a_process_with_all_settings(tmp_path, before):
     """By environment variables, as users set them; against a process without."""
     there, here = tmp_path / "there", tmp_path / "here"
     there.mkdir()
     here.mkdir()
-    code = f"import test_settings; test_settings.draw(); test_settings.work({str(there)!r})"
+    code = f"import test_settings; {before}test_settings.work({str(there)!r})"
     folders = os.pathsep.join([str(TESTS), str(Path(jx.__file__).parents[1])])
     environment = os.environ | VARIABLES | {"PYTHONPATH": folders}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=tmp_path)

@@ -464,6 +464,7 @@ def close(first, second):
     np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_eight_devices_give_what_one_gives(tmp_path):
     """Batch norm over the global batch, the same examples and crops: simulated devices in another process."""
     table = {**TABLE, "options": {}}

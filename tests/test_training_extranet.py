@@ -137,6 +137,7 @@ def test_the_relative_loss_is_what_is_left_of_the_first_guess(space, margin):
     np.testing.assert_allclose(total, expected["whole"] + 0.5 * expected["hole"], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_crops_by_error():
     """As likely around a pixel as its squared error is large, in holes more so; the weight is no part of the batch."""
     task, made = example(crops="error", space="display", crop=(4, 4), hole_weight=0.0)
