@@ -79,6 +79,7 @@ def test_what_inputs_name(tmp_path):
     a, b = tmp_path / "a" / "Clip 1", tmp_path / "b" / "clip_1"
     assert names([str(a), str(b), str(a.parent / ".." / "a" / "Clip 1")]) == ["a-Clip_1", "b-clip_1"]
     assert names([str(a), str(tmp_path / "a" / "other")]) == ["Clip_1", "other"]
+    assert names([str(tmp_path / "bunker" / "540p"), str(tmp_path / "town")]) == ["bunker-540p", "town"]
     assert names([str(a), str(a.with_name("Clip?1"))]) == ["Clip_1", "Clip_1-2"]
     assert names([str(a / "jaxtrapolate.toml")]) == ["Clip_1"]
 

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from jaxtrapolate.files import InputError, Sequence, open_sequence
 from jaxtrapolate.files.atomic import os_input_error
+from jaxtrapolate.files.listing import folder_name
 from jaxtrapolate.methods import Method, load, method_names
 from jaxtrapolate.metrics import Metric, metric_names
 from jaxtrapolate.metrics import load as load_metric
@@ -52,11 +53,13 @@ class Input:
         text: the argument, for messages.
         name: of its folder of results, different for each input.
         open: its sequence; raises InputError where it cannot be used.
+        parts: how many parts of its path, at least, its name is made of: one, unless the last says nothing by itself.
     """
 
     text: str
     name: str
     open: Callable[[], Sequence]
+    parts: int = 1
 
 
 def open_input(text: str, *, motion: str | None = None, strict: bool = False) -> Sequence:
@@ -96,7 +99,8 @@ def named_inputs(
         else:
             path = _resolved(text)
             folder = path.parent if path.suffix == ".toml" else path
-            found.setdefault(path, Input(text, "/".join(folder.parts[1:]), _folder(text, motion, strict)))
+            parts = folder_name(folder).count("/") + 1
+            found.setdefault(path, Input(text, "/".join(folder.parts[1:]), _folder(text, motion, strict), parts))
     return _named_apart(list(found.values()))
 
 
@@ -150,9 +154,9 @@ def _named_apart(inputs: list[Input]) -> list[Input]:
     names: list[str] = []
     for entry in inputs:
         others = [other for other in inputs if other is not entry]
-        counts = range(1, deepest + 1)
+        counts = range(entry.parts, deepest + 1)
         apart = (n for n in counts if all(ends(entry, n).lower() != ends(other, n).lower() for other in others))
-        names.append(ends(entry, next(apart, 1)))
+        names.append(ends(entry, next(apart, entry.parts)))
     result, taken = [], set()
     for entry, plain in zip(inputs, names, strict=True):
         tries = (plain if i == 1 else f"{plain}-{i}" for i in range(1, len(inputs) + 2))
