@@ -42,7 +42,7 @@ def scenes(monkeypatch):
 @pytest.fixture(scope="module")
 def dump(tmp_path_factory):
     """An Unreal-style dump of four frames."""
-    folder = tmp_path_factory.mktemp("dumps") / "dump"
+    folder = tmp_path_factory.mktemp("dumps") / "wall"
     folder.mkdir()
     for time in range(4):
         write_unreal_frame(folder, "Wall", time, make_frame(time, SIZE), keyframe=make_keyframe(time, SIZE))
@@ -123,9 +123,9 @@ def test_several_inputs(capsys, scenes, dump, tmp_path):
     said = [line for line in err.splitlines() if line.startswith("jaxtrapolate: ")]
     assert [line.split(": ")[1] for line in said] == [str(gone), "scenes:moon"]
     assert sorted(p.name for p in output.iterdir()) == [
-        *("demo-1", "dump", "report.html", "results.json", "run.json", "still-2"),
+        *("demo-1", "report.html", "results.json", "run.json", "still-2", "wall"),
     ]
-    single = {n: read(output / n / "results.json") for n in ("dump", "demo-1", "still-2")}
+    single = {n: read(output / n / "results.json") for n in ("wall", "demo-1", "still-2")}
     assert [r["size"] for r in single.values()] == [[32, 48], [36, 48], [36, 48]]
     whole = read(output / "results.json")
     assert [i["folder"] for i in whole["inputs"]] == list(single)

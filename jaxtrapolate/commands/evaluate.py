@@ -43,7 +43,7 @@ from jaxtrapolate.evaluation import (
     windows,
 )
 from jaxtrapolate.files import InputError, Sequence, gaps, runs
-from jaxtrapolate.methods import Method
+from jaxtrapolate.methods import Method, method_names
 from jaxtrapolate.metrics import Metric, metric_names
 from jaxtrapolate.metrics import load as load_metric
 from jaxtrapolate.output import Output, code, open_output, read_json, writable_folder, write_json
@@ -61,7 +61,9 @@ def add_parser(subparsers: Any) -> None:
         "Several inputs get a folder each below DIR, and DIR sums them up.",
     )
     add_input(parser, several=True)
-    parser.add_argument("--methods", required=True, metavar="A,B,C", help="names of methods, separated by commas")
+    parser.add_argument(
+        "--methods", metavar="A,B,C", help=f"separated by commas, of {', '.join(method_names())} (all that can run)"
+    )
     add_weights(parser)
     parser.add_argument("--output", required=True, metavar="DIR", help="for results.json, report.html and pictures")
     parser.add_argument(
@@ -80,7 +82,8 @@ def add_parser(subparsers: Any) -> None:
 def run(options: argparse.Namespace) -> int:
     """Runs the command; 2 where some of several inputs could not be used, or no method ran."""
     console, out = terminal(stderr=True), terminal()
-    methods, unavailable = open_methods(options.methods, weights=options.weights)
+    named = options.methods is not None
+    methods, unavailable = open_methods(options.methods if named else method_names(), weights=options.weights)
     metrics = open_metrics(options.metrics)
     inputs = named_inputs(options.inputs, **{n: getattr(options, n) for n in ("motion", "strict", "size", "length")})
     video = Video.parse(options.video, fps=options.fps, several=len(inputs) > 1)
@@ -105,7 +108,7 @@ def run(options: argparse.Namespace) -> int:
     if results is not None:
         print_table(results, out)
         console.print(f"{folder / 'results.json'} and {folder / 'report.html'}", soft_wrap=True, highlight=False)
-        for name, reason in results["skipped"].items():
+        for name, reason in results["skipped"].items() if named else ():
             print(f"jaxtrapolate: {name} was left out: {reason}", file=sys.stderr)
     for reason in failed.values():
         print(f"jaxtrapolate: {reason}", file=sys.stderr)

@@ -24,6 +24,7 @@ from jaxtrapolate.commands.inputs import (
 from jaxtrapolate.files import InputError, Sequence, runs, write_frame
 from jaxtrapolate.files.reader import stored_size
 from jaxtrapolate.frame_forecast import forecast
+from jaxtrapolate.methods import BEST_FIRST, method_names
 from jaxtrapolate.methods.method import Frames, Method, neighbours, rendered
 from jaxtrapolate.output import open_output, write_json
 from jaxtrapolate.records import Frame, replace
@@ -39,7 +40,9 @@ def add_parser(subparsers: Any) -> None:
         "after each: between it and the next by methods that interpolate, else by its motion carried on.",
     )
     add_input(parser)
-    parser.add_argument("--method", required=True, metavar="M", help="name of a method")
+    parser.add_argument(
+        "--method", metavar="M", help=f"of {', '.join(method_names())} (the best that can run: {', '.join(BEST_FIRST)})"
+    )
     add_weights(parser)
     parser.add_argument("--output", required=True, metavar="DIR", help="for the frames: EXR for HDR input, else PNG")
     parser.add_argument("--factor", type=int, default=2, metavar="N", help="frame rate out over frame rate in (2)")
@@ -67,21 +70,18 @@ def run(options: argparse.Namespace) -> None:
     console = terminal(stderr=True)
     if options.factor < 2 or options.factor > 1000:
         raise InputError(f"--factor: expected 2 to 1000, got {options.factor}")
-    method = _one(*open_methods(options.method, option="--method", weights=options.weights))
     sequence = open_input(options.input, motion=options.motion, strict=options.strict)
-    missing = [n for n in sequence.numbers if not sequence.has_color(n)]
-    if missing:
-        jobs, how = list(_missing(sequence, method, missing)), "from the buffers drawn for them"
-    elif method.kind == "interpolation":
-        jobs, how = list(_between(sequence, method, options.factor)), "between each two rendered frames"
+    if options.method is None:
+        method, jobs, how = _best(sequence, options.factor, options.weights)
     else:
-        jobs = list(_onward(sequence, method, options.factor))
-        how = "after each rendered frame, by its motion carried on: no buffers were drawn for them"
+        method = _one(*open_methods(options.method, option="--method", weights=options.weights))
+        jobs, how = _jobs(sequence, method, options.factor)
+    all_rendered = all(map(sequence.has_color, sequence.numbers))
     settings = {
         **sequence.identity(),
         "method": method.name,
         "weights": fingerprint(method.state) if jax.tree.leaves(method.state) else None,
-        "factor": None if missing else options.factor,
+        "factor": options.factor if all_rendered else None,
     }
     with open_output(options.output, "generate", settings, fresh=options.fresh) as output:
         suffix = ".exr" if sequence.hdr else ".png"
@@ -126,6 +126,36 @@ def run(options: argparse.Namespace) -> None:
     console.print(text, soft_wrap=True, highlight=False)
     for note in sequence.notes:
         console.print(f"note: {note}", soft_wrap=True, highlight=False)
+
+
+def _jobs(sequence: Sequence, method: Method, factor: int) -> tuple[list[Job], str]:
+    """What is to be made with a method, and how that is called."""
+    missing = [n for n in sequence.numbers if not sequence.has_color(n)]
+    if missing:
+        return list(_missing(sequence, method, missing)), "from the buffers drawn for them"
+    if method.kind == "interpolation":
+        return list(_between(sequence, method, factor)), "between each two rendered frames"
+    how = "after each rendered frame, by its motion carried on: no buffers were drawn for them"
+    return list(_onward(sequence, method, factor)), how
+
+
+def _best(sequence: Sequence, factor: int, weights: list[str]) -> tuple[Method, list[Job], str]:
+    """The first of `BEST_FIRST` that can make the frame in the middle, and what is to be made with it."""
+    reasons = []
+    for name in BEST_FIRST:
+        own = [w for w in weights if w.startswith(f"{name}=")]
+        methods, unavailable = open_methods(name, option="--method", weights=own)
+        for method in methods.values():
+            jobs, how = _jobs(sequence, method, factor)
+            try:
+                given = jobs[len(jobs) // 2].given() if jobs else "too few frames"
+            except InputError as error:
+                given = str(error)
+            if not isinstance(given, str):
+                return method, jobs, how
+            reasons.append(f"{name}: {given}")
+        reasons += [f"{name}: {reason}" for reason in unavailable.values()]
+    raise InputError(f"{sequence.name}: no method can run: {'; '.join(reasons)}")
 
 
 def _whole(path: Path, size: tuple[int, int], scale: int) -> bool:

@@ -14,7 +14,7 @@ from jaxtrapolate.commands import interrupt
 
 def parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    from jaxtrapolate.commands import check, demo, evaluate, generate, import_weights, render, scenes, train
+    from jaxtrapolate.commands import check, demo, evaluate, generate, import_weights, methods, render, scenes, train
 
     top = argparse.ArgumentParser(
         prog="jaxtrapolate",
@@ -22,7 +22,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"jaxtrapolate {__version__}")
     subparsers = top.add_subparsers(required=True, metavar="COMMAND")
-    for command in (demo, check, generate, evaluate, render, scenes, train, import_weights):
+    for command in (demo, check, generate, evaluate, methods, render, scenes, train, import_weights):
         command.add_parser(subparsers)
     return top
 

@@ -1,6 +1,8 @@
 """Methods by name: `jaxtrapolate.load`."""
 
 from collections.abc import Callable
+from importlib.metadata import EntryPoint, entry_points
+from inspect import getdoc
 from os import PathLike
 
 from jaxtrapolate.methods import (
@@ -44,13 +46,57 @@ _NETWORKS: dict[str, Callable[[str | PathLike[str]], Method]] = {
 """Methods with weights, each made from a file of them."""
 
 
+_DESCRIBED: dict[str, Callable[..., Method]] = _METHODS | {
+    "extranet": extranet.extranet,
+    "interpolator": interpolator.interpolator,
+}
+
+BEST_FIRST = (
+    *("bidirectional_guided", "bidirectional", "extranet", "guided_warp", "bidirectional_image", "interpolator"),
+    *("occlusion_warp", "softmax_splat", "dis", "warp", "blend", "repeat"),
+)
+"""Methods by what they have been worth on embedded scenes: what is used where none is named is the first that can."""
+
+ENTRY_POINTS = "jaxtrapolate.methods"
+"""The group of entry points by which other packages add methods, see `load`."""
+
+
+def _others() -> dict[str, EntryPoint]:
+    """The methods of other packages by name; those of this one go before them."""
+    found = entry_points(group=ENTRY_POINTS)
+    return {point.name: point for point in sorted(found, key=lambda p: p.name) if point.name not in _DESCRIBED}
+
+
 def method_names() -> tuple[str, ...]:
-    """The names that `load` knows; some need a file of weights."""
-    return (*_METHODS, *_NETWORKS)
+    """The names that `load` knows, those of other installed packages last; some need a file of weights."""
+    return (*_METHODS, *_NETWORKS, *_others())
+
+
+def method_description(name: str) -> str:
+    """The first line that a method's own documentation says.
+
+    Raises:
+        ValueError: an unknown name, or a method of another package that cannot be imported.
+    """
+    return (getdoc(_DESCRIBED[name] if name in _DESCRIBED else _factory(name)) or "").partition("\n")[0]
+
+
+def _factory(name: str) -> Callable[..., Method]:
+    point = _others().get(name)
+    if point is None:
+        raise ValueError(f"method: expected one of {', '.join(method_names())}, got {name!r}")
+    try:
+        return point.load()
+    except Exception as error:
+        package = point.dist.name if point.dist is not None else point.value
+        raise ValueError(f"method {name!r} of the package {package} cannot be imported: {error}") from error
 
 
 def load(name: str, *, weights: str | PathLike[str] = "default") -> Method:
     """A method by name.
+
+    A package adds one by an entry point of the group "jaxtrapolate.methods": its name, and a function that returns a
+    `Method`, called without arguments, or with `weights=` where a file of weights is named.
 
     Args:
         name: one of `method_names()`.
@@ -63,12 +109,15 @@ def load(name: str, *, weights: str | PathLike[str] = "default") -> Method:
     Raises:
         OSError: the file of weights cannot be read.
         ValueError: an unknown name, weights for a method that has none, a method without default weights, or a file
-            that holds none of that method.
+            that holds none of that method; a method of another package that cannot be imported or is none.
     """
     if name in _METHODS:
         if weights != "default":
             raise ValueError(f"weights: method {name!r} has none, got {str(weights)!r}")
         return _METHODS[name]()
-    if name not in _NETWORKS:
-        raise ValueError(f"method: expected one of {', '.join(method_names())}, got {name!r}")
-    return _NETWORKS[name](default_weights(name) if weights == "default" else weights)
+    if name in _NETWORKS:
+        return _NETWORKS[name](default_weights(name) if weights == "default" else weights)
+    method = _factory(name)() if weights == "default" else _factory(name)(weights=weights)
+    if not isinstance(method, Method):
+        raise ValueError(f"method {name!r}: expected its entry point to return a Method, got {type(method).__name__}")
+    return method

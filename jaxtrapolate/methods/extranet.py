@@ -189,7 +189,7 @@ def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
 
 
 def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Method:
-    """The method with a network's weights.
+    """Up to three rendered frames warped, demodulated, holes marked, and shaded by a network (ExtraNet).
 
     The three newest rendered frames are warped to the target, demodulated, and with masks; where fewer can be had the
     oldest is repeated. The network sees x `[H, W, 6]` (the first guess and the occlusion composite), mask `[H, W, 1]`,

@@ -19,7 +19,9 @@ _NAME = "interpolator"
 
 
 def interpolator(model: Interpolator) -> Method:
-    """The method with a network's weights: the baseline "learned video interpolation".
+    """The rendered frames around the target, interpolated by a network that sees nothing else (of the kind of IFRNet).
+
+    The baseline "learned video interpolation".
 
     The network sees the frames before and after through `compress`, as values of a display, and the target's time
     between them: `values["inputs"]` is `(first, second, time)`. Pixels that are not finite count as black or white.

@@ -1,0 +1,65 @@
+"""`jaxtrapolate methods`: what there is, and what a method consists of."""
+
+import argparse
+from typing import Any
+
+from rich.table import Table
+
+from jaxtrapolate.commands.inputs import terminal
+from jaxtrapolate.files import InputError
+from jaxtrapolate.methods import Method, load, method_description, method_names
+
+
+def add_parser(subparsers: Any) -> None:
+    """Adds the command to the command line."""
+    parser = subparsers.add_parser(
+        "methods",
+        help="the methods, or what one of them consists of",
+        description="Lists the methods, those of other installed packages too; with a NAME, its stages: what each "
+        "reads, and which are left out where that is missing.",
+    )
+    parser.add_argument("name", nargs="?", metavar="NAME", help=f"of {', '.join(method_names())}")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Runs the command."""
+    out = terminal()
+    if options.name is None:
+        table = Table()
+        for column in ("method", "kind", "frames", "what it does"):
+            table.add_column(column, no_wrap=column != "what it does")
+        for name in method_names():
+            method, text = _loaded(name)
+            table.add_row(name, "" if method is None else method.kind, "" if method is None else _frames(method), text)
+        out.print(table)
+        out.print("frames: rendered ones that it takes at most, before + after the one to be made", soft_wrap=True)
+        return
+    if options.name not in method_names():
+        raise InputError(f"no method {options.name!r}; there are {', '.join(method_names())}")
+    method, text = _loaded(options.name)
+    out.print(f"{options.name}: {text}", soft_wrap=True)
+    if method is None:
+        return
+    out.print(f"{method.kind}; rendered frames before + after: {_frames(method)}; size of the output: {method.scale} x")
+    table = Table(title="stages, in order")
+    for column in ("stage", "reads", "needed"):
+        table.add_column(column)
+    for stage in method.stages:
+        needs = [f"{stage.past} rendered frames in history"] if stage.past > 1 else []
+        needs += [" or ".join(r.split("|")) for r in stage.reads]
+        needs += [f'pip install "jaxtrapolate[{stage.extra}]"'] if stage.extra else []
+        table.add_row(stage.name, "; ".join(needs), "left out without" if stage.optional else "yes")
+    out.print(table)
+
+
+def _loaded(name: str) -> tuple[Method | None, str]:
+    """A method and its description; without it, why it cannot be had."""
+    try:
+        return load(name), method_description(name)
+    except ValueError as error:
+        return None, str(error)
+
+
+def _frames(method: Method) -> str:
+    return f"{method.past} + {method.future}"
