@@ -4,7 +4,6 @@ import argparse
 import os
 import sys
 import time
-import zlib
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -28,6 +27,8 @@ from jaxtrapolate.commands.inputs import (
 )
 from jaxtrapolate.commands.many import evaluate_many
 from jaxtrapolate.commands.pictures import write_pictures
+from jaxtrapolate.commands.runnable import history_costs, runnable
+from jaxtrapolate.commands.scores import Scores
 from jaxtrapolate.commands.tables import decibels, print_table
 from jaxtrapolate.commands.video import Video
 from jaxtrapolate.evaluation import (
@@ -154,7 +155,7 @@ def evaluate(
             "pictures": pictures,
             "video": None if video is None else f"{video.path.name}, {video.fps:g} fps",
         }
-        usable, skipped, left_out = _usable(sequence, methods, unavailable or {})
+        usable, skipped, left_out = runnable(sequence, methods, unavailable or {})
         past, future = max(m.past for m in usable.values()), max(m.future for m in usable.values())
         numbers = _chosen(held_back(sequence, past=past, future=future), frames, sequence, past)
         output.agree_frames(sequence, _needed(sequence, numbers, past, future), step=step)
@@ -222,7 +223,7 @@ def _evaluate(
         "hdr": sequence.hdr,
         "settings": requested | {"past": past, "future": future},
         "metrics": {n: {"per": m.per, "better": m.better, "unit": m.unit} for n, m in metrics.items()},
-        "notes": _notes(sequence, numbers) + _costs(sequence, methods) + _unscored(frame_scores) + unscored,
+        "notes": _notes(sequence, numbers) + history_costs(sequence, methods) + _unscored(frame_scores) + unscored,
         "frames": numbers,
         "methods": {
             name: _summary(found, metrics, kept.compile_ms.get(name))
@@ -247,59 +248,6 @@ def _evaluate(
     return results
 
 
-class Scores:
-    """The scores of frames that outlive a killed run, a JSON file a frame, with times of compilation and of stages.
-
-    What is not of the shape that this version writes, or lacks a metric, counts as not there.
-    """
-
-    def __init__(self, folder: Path, metrics: dict[str, Metric]) -> None:
-        self._folder, self._metrics = folder, metrics
-        compiled, stages = (read_json(folder / f"{name}.json") for name in ("compile", "stages"))
-        compiled, stages = (v if isinstance(v, dict) else {} for v in (compiled, stages))
-        self.compile_ms: dict[str, float] = {n: float(v) for n, v in compiled.items() if isinstance(v, int | float)}
-        self.stages: dict[str, Any] = {n: v for n, v in stages.items() if isinstance(v, dict)}
-
-    def frame(self, number: int) -> dict[str, dict[str, Any]]:
-        """The scores of a frame by method."""
-        entries = read_json(self._folder / f"{number:04d}.json")
-        entries = entries if isinstance(entries, dict) else {}
-        return {name: entry for name, entry in entries.items() if self._complete(entry, number)}
-
-    def _complete(self, entry: Any, number: int) -> bool:
-        if not isinstance(entry, dict) or entry.get("number") != number:
-            return False
-        numeric = all(isinstance(entry.get(key), int | float) for key in ("psnr", "ms"))
-        wanted = [m.name for m in self._metrics.values() if m.per != "clip" and m.name != "psnr"]
-        causes = entry.get("by_cause")
-        by_cause = isinstance(causes, dict) and all(
-            isinstance(c, dict) and all(isinstance(c.get(k), int | float) for k in ("psnr", "share"))
-            for c in causes.values()
-        )
-        scored = all(m in entry and isinstance(entry[m], int | float | None) for m in wanted)
-        return numeric and scored and by_cause and isinstance(entry.get("unscored", {}), dict)
-
-    def write(self, number: int, scores: dict[str, Any]) -> None:
-        """Keeps a frame's scores, beside those of methods that are not asked for now."""
-        path = self._folder / f"{number:04d}.json"
-        there = read_json(path)
-        write_json(self._folder / "compile.json", self.compile_ms)
-        write_json(self._folder / "stages.json", self.stages)
-        write_json(path, (there if isinstance(there, dict) else {}) | scores)
-
-    def clips(self, numbers: list[int]) -> dict[str, dict[str, float]]:
-        """The metrics of clips, by method, over just these frames."""
-        found = read_json(self._clip(numbers))
-        return {n: v for n, v in found.items() if isinstance(v, dict)} if isinstance(found, dict) else {}
-
-    def write_clips(self, numbers: list[int], found: dict[str, dict[str, float]]) -> None:
-        """Keeps the metrics of clips."""
-        write_json(self._clip(numbers), found)
-
-    def _clip(self, numbers: list[int]) -> Path:
-        return self._folder / f"clip-{zlib.crc32(repr(numbers).encode()):08x}.json"
-
-
 def _finished(folder: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
     """The results in a folder, where they are complete and of these settings."""
     results = read_json(folder / "results.json")
@@ -308,65 +256,6 @@ def _finished(folder: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
     same = all(k in results["settings"] and results["settings"][k] == v for k, v in settings.items())
     files = ["report.html", *filter(None, [results.get("video")])]
     return results if same and all((folder / name).exists() for name in files) else None
-
-
-def _usable(
-    sequence: Sequence, methods: dict[str, Method], unavailable: dict[str, str]
-) -> tuple[dict[str, Method], dict[str, str], dict[str, dict[str, list[str]]]]:
-    """The methods that can be scored, why the others cannot, and what stages are left out of each that can.
-
-    Raises:
-        InputError: none can.
-    """
-    usable, skipped, left_out = {}, dict(unavailable), {}
-    for name, method in methods.items():
-        numbers = held_back(sequence, past=method.past, future=method.future)
-        if not numbers:
-            skipped[name] = (
-                f"too few frames, needs {_window_length(method)} in a row without a gap; the longest row of the "
-                f"{len(sequence.numbers)} has {max(map(len, runs(sequence)))}"
-            )
-            continue
-        window = next(iter(windows(sequence, numbers[:1], past=method.past, future=method.future)))
-        if window.truth.color is None:
-            raise InputError(f"{sequence.name}: frame {window.number} has no colour to compare with; use generate")
-        given = arguments(method, window)
-        try:
-            method.active(*given)
-            usable[name], left_out[name] = method, method.missing(*given)
-        except ValueError as error:
-            skipped[name] = str(error)
-    if not usable:
-        reasons = "; ".join(f"{name}: {why}" for name, why in skipped.items())
-        raise InputError(f"{sequence.name}: no method can run: {reasons}")
-    return usable, skipped, left_out
-
-
-def _window_length(method: Method) -> int:
-    """How many frames in a row a method's window has, the held-back one included."""
-    return 2 * method.past + max(0, 2 * method.future - 1)
-
-
-def _costs(sequence: Sequence, methods: dict[str, Method]) -> list[str]:
-    """For methods that need more frames around a held-back one than the others: how many scored frames that costs."""
-
-    def count(chosen: dict[str, Method]) -> int:
-        past, future = max(m.past for m in chosen.values()), max(m.future for m in chosen.values())
-        return len(held_back(sequence, past=past, future=future))
-
-    notes, all_of_them = [], count(methods)
-    for what, need in (("before", lambda m: m.past), ("after", lambda m: m.future)):
-        most = max(need(m) for m in methods.values())
-        demanding = [name for name, m in methods.items() if need(m) == most]
-        others = {name: m for name, m in methods.items() if name not in demanding}
-        cost = count(others) - all_of_them if others else 0
-        if cost:
-            names = f"{', '.join(demanding)} need{'s' if len(demanding) == 1 else ''}"
-            notes.append(
-                f"{names} {most} rendered frame{'s' if most > 1 else ''} {what} a held-back one: {all_of_them} frames "
-                f"can be scored; without {'it' if len(demanding) == 1 else 'them'} there are {cost} more"
-            )
-    return notes
 
 
 def _chosen(numbers: list[int], frames: str | None, sequence: Sequence, past: int) -> list[int]:
