@@ -130,6 +130,7 @@ def test_flow_that_is_not_finite_is_visible_nowhere():
     assert np.isfinite(made.color).all()
 
 
+@pytest.mark.slow
 def test_gradients(x64):
     rng = np.random.default_rng(8)
     flow = rng.uniform(0.2, 0.4, (H, W, 3)) * [1, 1, 0.01]

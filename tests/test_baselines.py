@@ -273,7 +273,9 @@ def test_compiled_whole_is_stage_by_stage(methods, name):
     assert np.isfinite(image).all()
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (13, 11)])
+@pytest.mark.parametrize(
+    "size", [(1, 1), pytest.param((1, 7), marks=pytest.mark.slow), pytest.param((13, 11), marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("name", NAMES)
 def test_any_size(methods, name, size):
     image = methods[name](*given(name, size=size))

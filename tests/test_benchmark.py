@@ -87,6 +87,7 @@ def test_answers_of_a_peer_agree(operations, tmp_path, monkeypatch, module, name
             assert set(entry["difference"]) == {"max", "share", "tolerance"}
 
 
+@pytest.mark.slow
 def test_a_peer_that_answers_otherwise_is_not_timed(operations, tmp_path, capsys):
     wrong = operations.Peer("wrong", "scipy", lambda parallel, image, motion: lambda: image + 1)
     operation = operations.Operation("wrong", lambda image, motion: image, ("image", "motion"), (wrong,))

@@ -372,6 +372,7 @@ def test_offsets_start_the_next_frame():
 # Attributes
 
 
+@pytest.mark.slow
 def test_attributes_are_shaded_in_the_frame_made():
     previous, next = pair(channels=5)
 
@@ -384,6 +385,7 @@ def test_attributes_are_shaded_in_the_frame_made():
     assert jx.interpolate_run(previous, next, factor=3, shade=shade).shape == (2, H, W, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["float16", "bfloat16"])
 def test_half_precision(x64, kind):
     """Colours of half precision, coordinates of float32: a place 600 pixels away is still right."""

@@ -13,6 +13,7 @@ from synthetic import make_frame, make_keyframe
 import jaxtrapolate as jx
 import jaxtrapolate.commands.evaluate as command
 from jaxtrapolate.commands.main import main
+from jaxtrapolate.commands.runnable import history_costs
 from jaxtrapolate.evaluation import hide
 from jaxtrapolate.files import open_sequence, read_exr, write_exr, write_unreal_frame
 
@@ -230,6 +231,19 @@ def test_methods_that_cannot_run_are_named(capsys, tmp_path):
     assert "no method can run: warp: " in refused(capsys, *common, "warp")
 
 
+def test_what_each_history_costs(still_dump):
+    sequence = open_sequence(still_dump)  # six frames: 1, 3 and 5 are held back
+    methods = {name: jx.load(name) for name in ("repeat", "warp", "occlusion_warp", "blend")}
+    before = "occlusion_warp needs 2 rendered frames before a held-back one"
+    after = "blend needs 1 rendered frame after a held-back one"
+    assert history_costs(sequence, {n: methods[n] for n in ("repeat", "warp")}) == []
+    (note,) = history_costs(sequence, {n: methods[n] for n in ("repeat", "occlusion_warp")})
+    assert note == f"{before}: 2 frames can be scored; without it there are 1 more"
+    notes = history_costs(sequence, methods)
+    assert notes == [f"{t}: 1 frames can be scored; without it there are 1 more" for t in (before, after)]
+
+
+@pytest.mark.slow
 def test_what_a_long_history_costs_is_said(capsys, still_dump, tmp_path):
     common = ("evaluate", still_dump, "--output", tmp_path, "--pictures", 0, "--methods")
     code, out, _ = run(capsys, *common, "repeat,occlusion_warp")

@@ -224,6 +224,7 @@ def test_around_takes_the_farthest_then_the_closest():
     assert np.asarray(fill_around(image, covered, depth=depth))[2, 2, 0] == image[4, 2, 0]
 
 
+@pytest.mark.slow
 def test_filling_is_linear_and_differentiable():
     image, covered = random(7, 9, 2), holes((7, 9))
     for fill in (fill_pyramid, fill_around):

@@ -239,6 +239,7 @@ def soft(motion, softness, *, target=None, source=None, weights=None):
     return soft_function()(*arrays, np.float64(softness), weights, gbuffer(target), gbuffer(source))
 
 
+@pytest.mark.slow
 def test_soft_masks_become_hard(x64):
     target, source, motion = buffers(1, np.float64), buffers(2, np.float64), random_motion(*SIZE, dtype=np.float64)
     (_, masks), _ = soft(motion, 1e-5)

@@ -76,6 +76,7 @@ def with_attributes(size, steps=4):
                  for k, frame in enumerate(moving(steps, size)))  # fmt: skip
 
 
+@pytest.mark.slow
 def test_light_that_changes_between_rendered_frames():
     """Attributes are lit by each frame's own light; colours can only be blended, here of two bright frames."""
     size, steps, times = (48, 61), 4, np.float32([0.25, 0.5, 0.75])

@@ -340,7 +340,7 @@ def test_times_seeds_and_objects_share_one_compilation(scene, frame):
     assert _render._cache_size() == count
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 7)])
+@pytest.mark.parametrize("size", [pytest.param((1, 1), marks=pytest.mark.slow), (1, 7)])
 def test_small_sizes(scene, size):
     assert flow(scene, 3.0, 1.0, size=size).shape == (*size, 3)
     assert visible(scene, 3.0, 1.0, size=size).shape == size

@@ -65,6 +65,7 @@ def test_a_mirror_shows_what_the_mirrored_ray_meets():
     assert np.abs(frame.color[dim]).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_penumbra_is_as_wide_as_the_sun_makes_it():
     height, radius, softness = 2.0, 0.4, 0.1
     b = Builder()

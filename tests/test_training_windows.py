@@ -157,7 +157,7 @@ def dump(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("together", [1, 2])
+@pytest.mark.parametrize("together", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_windows_of_dumps(dump, together):
     """Three of eight frames have five before them: each window is as evaluation has it; the last is for validation."""
     options = WindowOptions(dumps=(str(dump),), dumps_share=1.0, flip=(0, 0), together=together)
