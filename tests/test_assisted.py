@@ -191,6 +191,7 @@ def test_rendered_over_frames_that_leave_it_out():
     np.testing.assert_array_equal(over.depth, made.depth)
 
 
+@pytest.mark.slow
 def test_runs_with_targets():
     previous, next = layers(speed=6)
     targets = jax.tree.map(lambda *a: jnp.stack(a), bar_target(0.5), bar_target(0.5))

@@ -434,6 +434,7 @@ def test_the_color_alone_is_that_of_all_outputs():
     np.testing.assert_allclose(jax.jit(lambda *a: make(*a).color)(*given), made.color, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_against_differences(x64):
     """With respect to colours, flow and alpha: of a smooth bilinear flow, away from choices."""
     size = (5, 6)

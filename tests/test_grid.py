@@ -76,6 +76,7 @@ def test_the_nearer_layer_covers_and_its_silhouette_is_followed():
     assert not covered[12:20, 12:16].any()
 
 
+@pytest.mark.slow
 def test_a_snapped_silhouette_arrives_where_a_coarse_one_does_not():
     size = (41, 41)
     box = np.zeros(size, bool)
@@ -116,6 +117,7 @@ def test_infinite_depth_lies_behind():
     assert np.array_equal(np.asarray(warped)[:, 16:], image[:, 16:])
 
 
+@pytest.mark.slow
 def test_eager_is_jit_is_vmap():
     size = (13, 18)
     image, depth = random(*size, 2), random(*size, 1, seed=2, low=0.5)

@@ -178,6 +178,7 @@ def pullback():
     return run
 
 
+@pytest.mark.slow
 def test_gradients_against_differences_of_the_loop(x64):
     """With respect to image, motion, both guides and both sigmas."""
     arrays = (*inputs(5, 7, dtype=np.float64, guides=1, amount=1), np.float64(0.5), np.float64(1.3))

@@ -129,6 +129,7 @@ def test_any_size(size, config):
     np.testing.assert_allclose(found[1], run(model, *pairs[1], 0.25), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite(model):
     """At the times of the frames and between, also where both frames are equal."""
     first, second = map(jnp.asarray, frames(6, 5))

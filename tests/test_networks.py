@@ -298,6 +298,7 @@ def test_any_size_against_a_network_in_float64(size):
     np.testing.assert_allclose(found[0], expected, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_direct_is_a_network_with_the_histories_among_its_features():
     """The same weights, the histories appended to the target's buffers, oldest first."""
     direct = ExtraNet(ExtraNetConfig(widths=(3, 4), features=2, histories=2, direct=True), rngs=nnx.Rngs(0))
@@ -399,6 +400,7 @@ def test_gradients(x64):
     assert any(np.any(g) for g in jax.tree.leaves(gradients[0]))
 
 
+@pytest.mark.slow
 def test_a_training_step_reaches_every_parameter():
     model = ExtraNet(SMALL, rngs=nnx.Rngs(1))
     model.train()

@@ -327,6 +327,7 @@ def test_gradients_beside_flow_that_is_not_finite(x64):
     np.testing.assert_array_equal(gradients[0][1, 2], 0)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_iterations():
     flow = jnp.asarray(smooth_flow(64, 64))
 

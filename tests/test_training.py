@@ -429,6 +429,7 @@ TABLE = {
 }
 
 
+@pytest.mark.slow
 def test_killed_in_the_middle_of_saving(whole, tmp_path):
     """SIGKILL when the second checkpoint has its files but not yet its name; the run goes on to the same numbers."""
     settings, workdir, _ = whole

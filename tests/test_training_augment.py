@@ -187,6 +187,7 @@ def test_crops_that_cannot_be():
         crop(jnp.zeros(5), jax.random.key(0), size=(2, 2))
 
 
+@pytest.mark.slow
 def test_a_weighted_crop_holds_what_has_weight():
     """All weight on one pixel: it is in every crop, at the border too, and everywhere in it."""
     image = jnp.stack(jnp.meshgrid(jnp.arange(11.0), jnp.arange(9.0)), -1)
