@@ -275,6 +275,7 @@ def test_a_method_with_too_few_frames_is_left_out(capsys, tmp_path):
         (("demo", "--frames", -3), "--frames: expected a number from 1"),
         (("evaluate", "scenes:demo", "--methods", "warp", "--length", 10**20), "--length: expected a number from 1"),
         (("evaluate", f"scenes:demo:{10**19 - 1}", "--methods", "warp"), "SEED: expected a number from 0"),
+        (("evaluate", "scenes:demo", "--methods", "warp", "--pictures", -5), "--pictures: expected 0 or more, got -5"),
         (("generate", "scenes:demo", "--method", "warp", "--factor", 10**9), "--factor: expected 2 to 1000"),
     ],
 )

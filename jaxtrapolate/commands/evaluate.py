@@ -87,6 +87,8 @@ def run(options: argparse.Namespace) -> int:
     methods, unavailable = open_methods(options.methods if named else method_names(), weights=options.weights)
     metrics = open_metrics(options.metrics)
     inputs = named_inputs(options.inputs, **{n: getattr(options, n) for n in ("motion", "strict", "size", "length")})
+    if options.pictures < 0:
+        raise InputError(f"--pictures: expected 0 or more, got {options.pictures}")
     video = Video.parse(options.video, fps=options.fps, several=len(inputs) > 1)
     chosen = {
         "metrics": metrics,
