@@ -28,7 +28,7 @@ from rich.table import Table
 from jaxtrapolate.networks.extranet import GATED_CONVOLUTION, ExtraNet, ExtraNetConfig
 from jaxtrapolate.networks.inference import fold, inference
 from jaxtrapolate.networks.interpolator import Interpolator, InterpolatorConfig
-from jaxtrapolate.timing import Timing, compiled, machine, measure_pairs, ratio
+from jaxtrapolate.runtime.timing import Timing, compiled, machine, measure_pairs, ratio
 
 EXTRANETS = {
     "extranet": ExtraNetConfig(),

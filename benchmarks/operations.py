@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 import jaxtrapolate as jt
-from jaxtrapolate.timing import Timing, compiled, machine, measure, measure_pairs, ratio
+from jaxtrapolate.runtime.timing import Timing, compiled, machine, measure, measure_pairs, ratio
 
 _ONE_THREAD = ("--xla_cpu_multi_thread_eigen=false", "intra_op_parallelism_threads=1")
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")

@@ -10,8 +10,8 @@ from pathlib import Path
 from PIL import Image, ImageDraw
 
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.commands.pictures import buffer_picture, eight_bit, motion_picture
-from jaxtrapolate.evaluation import display
+from jaxtrapolate.evaluation.pictures import buffer_picture, eight_bit, motion_picture
+from jaxtrapolate.evaluation.score import display
 from jaxtrapolate.scenes import SceneSequence, scene_names
 
 HERE = Path(__file__).parent

@@ -29,14 +29,15 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxtrapolate as jx
-from jaxtrapolate.causes import CAUSES
-from jaxtrapolate.evaluation import arguments, causes_of, mean_over_frames, score, windows
-from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.evaluation.score import causes_of, mean_over_frames, score
+from jaxtrapolate.evaluation.windows import arguments, windows
 from jaxtrapolate.methods import Method
 from jaxtrapolate.methods.extranet import Preparation, extranet
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
+from jaxtrapolate.ops.causes import CAUSES
+from jaxtrapolate.runtime.timing import machine
 from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence
-from jaxtrapolate.timing import machine
 from jaxtrapolate.training import Config, ExtraNetOptions, ExtraNetTask, Optimizer, train_and_evaluate
 from jaxtrapolate.training.windows import MOVING, WindowOptions
 

@@ -31,11 +31,11 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxtrapolate as jx
-from jaxtrapolate.assisted import shown
-from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.bidirectional.assisted import shown
+from jaxtrapolate.bidirectional.search import positions, within
+from jaxtrapolate.runtime.timing import machine
 from jaxtrapolate.scenes import Scene, flow, render, scene, visible
-from jaxtrapolate.search import positions, within
-from jaxtrapolate.timing import machine
 
 SCENES = "walkers:0.8,head:0.5,windmill:0.5,terrain:0.8,demo:0.8,interior:0.8,forest:0.8,dock:0.8,street:0.8"
 BELOW = (0.1, 0.5, 1.0)

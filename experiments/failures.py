@@ -23,12 +23,13 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxtrapolate as jx
-from jaxtrapolate.causes import CAUSES, cause_map
-from jaxtrapolate.evaluation import Window, arguments, display
-from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.evaluation.score import display
+from jaxtrapolate.evaluation.windows import Window, arguments
+from jaxtrapolate.ops.causes import CAUSES, cause_map
 from jaxtrapolate.records import replace
+from jaxtrapolate.runtime.timing import machine
 from jaxtrapolate.scenes import TEST_SEEDS, Scene, render, scene
-from jaxtrapolate.timing import machine
 from jaxtrapolate.training.windows import MOVING, scene_window
 
 SIZE = (180, 320)

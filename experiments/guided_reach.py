@@ -14,11 +14,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from jaxtrapolate.evaluation import arguments, causes_of, score, windows
-from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.evaluation.score import causes_of, score
+from jaxtrapolate.evaluation.windows import arguments, windows
 from jaxtrapolate.methods.warping import guided
+from jaxtrapolate.runtime.timing import machine
 from jaxtrapolate.scenes import TRAINING_SEEDS, SceneSequence, scene_names
-from jaxtrapolate.timing import machine
 
 SIZES = {"480p": (480, 854), "720p": (720, 1280), "1080p": (1080, 1920)}
 ROWS = (None, 240, 180, 120)

@@ -19,11 +19,12 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxtrapolate as jx
-from jaxtrapolate.evaluation import arguments, display, windows
-from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.evaluation.score import display
+from jaxtrapolate.evaluation.windows import arguments, windows
 from jaxtrapolate.methods.warping import guides
+from jaxtrapolate.runtime.timing import machine
 from jaxtrapolate.scenes import SceneSequence, scene_names
-from jaxtrapolate.timing import machine
 
 SIGMA_GUIDE = (0.01, 0.03, 0.05, 0.1, 0.2)
 SIGMA_SPACE = (0.3, 0.5, 0.7, 1.0, 2.0, 10.0)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxtrapolate.latency import Timeline, additional_lag, presentation_latency, simulate, summarize
-from jaxtrapolate.report.timeline import plot_latency
+from jaxtrapolate.latency.plot import plot_latency
 
 REFRESH = 120.0
 GENERATE = 1.0

@@ -24,11 +24,12 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxtrapolate as jx
-from jaxtrapolate.evaluation import display, hide
-from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.evaluation.score import display
+from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.methods.reprojection import reprojection
+from jaxtrapolate.runtime.timing import machine, measure
 from jaxtrapolate.scenes import Scene, render, scene
-from jaxtrapolate.timing import machine, measure
 
 SCENES = "walkers,terrain,head,interior,windmill"
 PARTS = 4

@@ -26,9 +26,9 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxtrapolate as jx
-from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.runtime.timing import machine
 from jaxtrapolate.scenes import flow, keyframe, render, scene, visible
-from jaxtrapolate.timing import machine
 
 KINDS = ("noise", "wrong object", "quantised")
 PENALTIES = {"photometric": 0.0, "photometric and smooth": 0.003}

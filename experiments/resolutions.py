@@ -18,13 +18,15 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxtrapolate as jx
-from jaxtrapolate.evaluation import Window, arguments, causes_of, mean_over_frames, score, time_stages, windows
-from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.evaluation.score import causes_of, mean_over_frames, score
+from jaxtrapolate.evaluation.stages import time_stages
+from jaxtrapolate.evaluation.windows import Window, arguments, windows
 from jaxtrapolate.methods import Method
 from jaxtrapolate.methods.extranet import Preparation, extranet
 from jaxtrapolate.networks.extranet import GATED_CONVOLUTION, ExtraNet, ExtraNetConfig
+from jaxtrapolate.runtime.timing import machine, measure, measure_pairs
 from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence
-from jaxtrapolate.timing import machine, measure, measure_pairs
 
 SIZES = {"480p": (480, 854), "720p": (720, 1280), "1080p": (1080, 1920)}
 METHODS = ("warp", "occlusion_warp", "guided_warp", "warp_3d", "grid_extrapolate", "bidirectional", "interpolator",

@@ -25,9 +25,9 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxtrapolate as jx
-from jaxtrapolate.files.atomic import atomic_path
-from jaxtrapolate.search import positions
-from jaxtrapolate.timing import machine, measure_pairs
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.bidirectional.search import positions
+from jaxtrapolate.runtime.timing import machine, measure_pairs
 
 METHODS = {
     "fixed point": {"solver": "fixed_point", "filter": "bilinear"},

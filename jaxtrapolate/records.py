@@ -11,7 +11,7 @@ receives them, by the functions `check_*` below.
 """
 
 import dataclasses
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import jax
 from jaxtyping import Array, Float
@@ -19,6 +19,11 @@ from jaxtyping import Array, Float
 from jaxtrapolate.checks import Size, check_array, check_image
 
 R = TypeVar("R")
+
+Sign = Literal["previous_minus_current", "current_minus_previous"]
+Units = Literal["pixels", "uv", "ndc"]
+YAxis = Literal["down", "up"]
+"""How motion vectors may be stated: see `jaxtrapolate.convert_motion`."""
 
 
 def record(cls: type[R]) -> type[R]:

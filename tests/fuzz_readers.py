@@ -493,7 +493,7 @@ def sequence(path: Path) -> None:
 
 def refusals(kind: str) -> tuple[type[Exception], ...]:
     """What may leave a reader of a kind, by its documentation."""
-    from jaxtrapolate.files import InputError
+    from jaxtrapolate.errors import InputError
 
     return (ValueError, OSError) if kind in ("npz", "torch", "orbax") else (InputError,)
 

@@ -7,7 +7,7 @@ import oracles
 from flax import nnx
 
 import jaxtrapolate as jx
-from jaxtrapolate.evaluation import hide
+from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
 
 SMALL = ExtraNetConfig(widths=(4, 6))

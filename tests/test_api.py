@@ -10,7 +10,8 @@ import pytest
 from oracles import look, perspective, random, random_motion
 
 import jaxtrapolate as jx
-from jaxtrapolate import holes, metrics, radiance
+from jaxtrapolate.metrics import image as metrics
+from jaxtrapolate.ops import holes, radiance
 
 PUBLIC = {
     name: value

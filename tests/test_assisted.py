@@ -9,7 +9,7 @@ from oracles import random
 from test_bidirectional import keyframe, layers
 
 import jaxtrapolate as jx
-from jaxtrapolate.assisted import CASES, blend
+from jaxtrapolate.bidirectional.assisted import CASES, blend
 
 pytestmark = pytest.mark.usefixtures("strict")
 

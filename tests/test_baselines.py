@@ -9,7 +9,7 @@ import pytest
 from synthetic import FAR, NEAR, make_frame, texture
 
 import jaxtrapolate as jx
-from jaxtrapolate.evaluation import hide
+from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.methods import Method, Stage
 from jaxtrapolate.methods.between import time_fraction
 from jaxtrapolate.methods.reprojection import reprojection, steps_onward
@@ -392,7 +392,8 @@ def test_without_opencv_the_extra_is_named(methods, monkeypatch):
 
 
 def decibels(method, folder, numbers):
-    from jaxtrapolate.evaluation import arguments, display, windows
+    from jaxtrapolate.evaluation.score import display
+    from jaxtrapolate.evaluation.windows import arguments, windows
     from jaxtrapolate.files import open_sequence
 
     sequence = open_sequence(folder)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxtrapolate import timing
+from jaxtrapolate.runtime import timing
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 SIZE = "40x24"

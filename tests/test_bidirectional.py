@@ -13,7 +13,7 @@ from oracles import random
 from test_search import search_loop
 
 import jaxtrapolate as jx
-from jaxtrapolate.assisted import CASES
+from jaxtrapolate.bidirectional.assisted import CASES
 
 pytestmark = pytest.mark.usefixtures("strict")
 

@@ -7,7 +7,7 @@ import pytest
 from synthetic import SyntheticSequence, make_frame
 
 import jaxtrapolate as jx
-from jaxtrapolate.evaluation import arguments, hide, windows
+from jaxtrapolate.evaluation.windows import arguments, hide, windows
 from jaxtrapolate.records import GBuffer, replace
 
 NAMES = ("bidirectional", "bidirectional_image", "bidirectional_guided")
@@ -170,7 +170,7 @@ def test_buffers_of_one_frame_alone_do_not_break_it(methods):
     ],
 )
 def test_known_figures(data, folder, numbers, name, least):
-    from jaxtrapolate.evaluation import causes_of, score
+    from jaxtrapolate.evaluation.score import causes_of, score
     from jaxtrapolate.files import open_sequence
 
     sequence, method = open_sequence(data / folder), jx.load(name)

@@ -11,15 +11,17 @@ from synthetic import SyntheticSequence, make_frame, make_keyframe
 
 import jaxtrapolate as jx
 import jaxtrapolate.commands.evaluate as command
-from jaxtrapolate import metrics as metrics_module
 from jaxtrapolate.commands import inputs as inputs_module
 from jaxtrapolate.commands.inputs import named_inputs
 from jaxtrapolate.commands.main import main
 from jaxtrapolate.commands.video import _shown
-from jaxtrapolate.evaluation import display, mean_over_inputs, windows
-from jaxtrapolate.files import InputError, write_unreal_frame
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.evaluation.score import display, mean_over_inputs
+from jaxtrapolate.evaluation.windows import windows
+from jaxtrapolate.files import write_unreal_frame
 from jaxtrapolate.metrics import Metric
-from jaxtrapolate.perceptual import ClipScore
+from jaxtrapolate.metrics import registry as metrics_module
+from jaxtrapolate.metrics.perceptual import ClipScore
 from jaxtrapolate.scenes import TEST_SEEDS, scene_names
 
 SIZE = (32, 48)

@@ -13,8 +13,8 @@ from synthetic import make_frame, make_keyframe
 import jaxtrapolate as jx
 import jaxtrapolate.commands.evaluate as command
 from jaxtrapolate.commands.main import main
-from jaxtrapolate.commands.runnable import history_costs
-from jaxtrapolate.evaluation import hide
+from jaxtrapolate.evaluation.runnable import history_costs
+from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.files import open_sequence, read_exr, write_exr, write_unreal_frame
 
 SIZE = (32, 48)

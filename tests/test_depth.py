@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import jaxtrapolate as jx
-from jaxtrapolate.causes import edges
-from jaxtrapolate.depth import apart, held, released, surface_depth, surfaces
-from jaxtrapolate.fill import fill_around
-from jaxtrapolate.grid import grid_warp
 from jaxtrapolate.methods.extranet import minmax_depth, relative_depth
+from jaxtrapolate.ops.causes import edges
+from jaxtrapolate.ops.depth import apart, held, released, surface_depth, surfaces
+from jaxtrapolate.ops.fill import fill_around
+from jaxtrapolate.ops.grid import grid_warp
 from jaxtrapolate.records import Frame, GBuffer, Keyframe, replace
 
 SIZE = (8, 12)

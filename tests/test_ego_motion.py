@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from synthetic import static_scene as scene
 
-from jaxtrapolate.ego_motion import camera_matrix, off_camera, static_ids
+from jaxtrapolate.ops.ego_motion import camera_matrix, off_camera, static_ids
 
 SIZE = (48, 64)
 

@@ -7,7 +7,9 @@ import pytest
 from synthetic import BOX, PAN, SyntheticSequence, make_frame, make_keyframe
 
 import jaxtrapolate as jx
-from jaxtrapolate.evaluation import causes_of, held_back, hide, mean_over_frames, score, time_stages, windows
+from jaxtrapolate.evaluation.score import causes_of, mean_over_frames, score
+from jaxtrapolate.evaluation.stages import time_stages
+from jaxtrapolate.evaluation.windows import held_back, hide, windows
 
 
 def test_every_second_frame_is_held_back():

@@ -15,7 +15,8 @@ import jaxtrapolate as jx
 from jaxtrapolate import weights
 from jaxtrapolate.commands.inputs import open_methods
 from jaxtrapolate.commands.main import main
-from jaxtrapolate.evaluation import arguments, causes_of, score, windows
+from jaxtrapolate.evaluation.score import causes_of, score
+from jaxtrapolate.evaluation.windows import arguments, windows
 from jaxtrapolate.files import write_unreal_frame
 from jaxtrapolate.methods import extranet as module
 from jaxtrapolate.methods.extranet import RELEASE, Preparation, extranet
@@ -258,9 +259,9 @@ def test_imported_weights_are_the_authors(capsys, official, tmp_path):
 @pytest.mark.slow
 def test_known_figures_of_a_path_traced_clip(official, data):
     """The authors' weights, trained on another scene: 28.7 dB, 19.4 in exact disocclusion."""
-    from jaxtrapolate.causes import disoccluded
-    from jaxtrapolate.evaluation import arguments, windows
+    from jaxtrapolate.evaluation.windows import arguments, windows
     from jaxtrapolate.files import open_sequence
+    from jaxtrapolate.ops.causes import disoccluded
 
     sequence, method = open_sequence(data / "czest1dm"), jx.load("extranet", weights=official)
     whole, holes = [], []

@@ -13,10 +13,10 @@ import pytest
 import tifffile
 from PIL import Image
 
-from jaxtrapolate.files import InputError, open_sequence, read_exr, read_png, write_exr, write_png
+from jaxtrapolate.errors import InputError, printable
+from jaxtrapolate.files import open_sequence, read_exr, read_png, write_exr, write_png
 from jaxtrapolate.files.exr import exr_size
 from jaxtrapolate.files.image import decode_srgb, image_header, image_size, read_image
-from jaxtrapolate.files.sequence import printable
 
 
 def codes(dtype, *shape, seed=0):

@@ -8,7 +8,8 @@ import random
 import numpy as np
 import pytest
 
-from jaxtrapolate.files import InputError, read_exr, write_exr
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.files import read_exr, write_exr
 from jaxtrapolate.files.exr import HALF_MAX, exr_channels, exr_size, layer_channels, pick
 from jaxtrapolate.files.exr_header import read_header
 

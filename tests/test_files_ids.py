@@ -5,9 +5,10 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from jaxtrapolate.files import InputError, UnrealSequence, open_sequence
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.files import UnrealSequence, open_sequence
 from jaxtrapolate.files.ids import LARGEST, Numbering, color_ids
-from jaxtrapolate.holes import hole_masks
+from jaxtrapolate.ops.holes import hole_masks
 from jaxtrapolate.records import GBuffer
 
 SIZE = (4, 6)

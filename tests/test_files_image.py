@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxtrapolate.files import InputError, read_exr, read_png, write_frame, write_png
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.files import read_exr, read_png, write_frame, write_png
 from jaxtrapolate.files.exr import pick
 from jaxtrapolate.files.image import decode_srgb, encode_srgb, image_size
 

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from synthetic import SyntheticSequence, make_frame, make_keyframe
 
-from jaxtrapolate.evaluation import causes_of, held_back, windows
-from jaxtrapolate.files import InputError, around, gaps, open_sequence, runs, write_exr, write_png, write_unreal_frame
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.evaluation.score import causes_of
+from jaxtrapolate.evaluation.windows import held_back, windows
+from jaxtrapolate.files import around, gaps, open_sequence, runs, write_exr, write_png, write_unreal_frame
 from jaxtrapolate.files.listing import folder_name
 from jaxtrapolate.records import Frame
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxtrapolate.files import InputError, MotionConvention, PackedSequence, open_sequence
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.files import MotionConvention, PackedSequence, open_sequence
 from jaxtrapolate.files.image import decode_srgb, encode_srgb
 from jaxtrapolate.files.packed import decode_motion, encode_motion
 

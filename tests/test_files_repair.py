@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.files.convention import convert, unconvert
 from jaxtrapolate.files.repair import LOST, fill_nearest, no_depth, repair
-from jaxtrapolate.files.sequence import InputError, MotionConvention
-from jaxtrapolate.motion import convert_motion
+from jaxtrapolate.files.sequence import MotionConvention
+from jaxtrapolate.ops.motion import convert_motion
 
 
 def test_finite_buffers_are_left_alone():

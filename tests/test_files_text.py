@@ -5,7 +5,8 @@ import os
 
 import pytest
 
-from jaxtrapolate.files import InputError, open_sequence
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.files import open_sequence
 from jaxtrapolate.files.description import read_settings
 from jaxtrapolate.files.text import read_json, read_toml
 from jaxtrapolate.training.config import load_config

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxtrapolate.files import InputError, MotionConvention, UnrealSequence, open_sequence, write_unreal_frame
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.files import MotionConvention, UnrealSequence, open_sequence, write_unreal_frame
 from jaxtrapolate.files.repair import LOST
 from jaxtrapolate.records import CHANNELS, Frame, GBuffer, Keyframe
 

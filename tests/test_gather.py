@@ -16,7 +16,7 @@ from hypothesis.extra.numpy import arrays
 from oracles import SIZES, inner_motion, random, random_motion
 
 import jaxtrapolate as jx
-from jaxtrapolate.gather import root
+from jaxtrapolate.ops.warp import root
 
 pytestmark = pytest.mark.usefixtures("strict")
 

@@ -7,9 +7,9 @@ import pytest
 from jax.test_util import check_grads
 from oracles import random
 
-from jaxtrapolate.fill import fill_around, fill_pyramid
-from jaxtrapolate.gather import backward_warp
-from jaxtrapolate.grid import grid_warp
+from jaxtrapolate.ops.fill import fill_around, fill_pyramid
+from jaxtrapolate.ops.grid import grid_warp
+from jaxtrapolate.ops.warp import backward_warp
 
 SIZES = [(1, 1), (1, 7), (6, 1), (13, 11), (32, 48)]
 

@@ -10,7 +10,7 @@ import pytest
 from oracles import random, random_motion
 
 import jaxtrapolate as jx
-from jaxtrapolate.guided import guided_taps
+from jaxtrapolate.ops.guided import guided_taps
 
 SIZE = (9, 11)
 SMALL = {"strides": (1,), "keep": 3}  # compiles fastest

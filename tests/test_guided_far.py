@@ -8,9 +8,9 @@ import pytest
 from oracles import random, random_motion
 
 import jaxtrapolate as jx
-from jaxtrapolate.evaluation import hide
-from jaxtrapolate.guided import far_motion
+from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.methods.warping import guided
+from jaxtrapolate.ops.guided import far_motion
 from jaxtrapolate.records import Frame, GBuffer
 
 

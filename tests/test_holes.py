@@ -11,7 +11,7 @@ import pytest
 from oracles import random, random_motion
 
 import jaxtrapolate as jx
-from jaxtrapolate.holes import HoleMasks, hole_masks
+from jaxtrapolate.ops.holes import HoleMasks, hole_masks
 from jaxtrapolate.records import replace
 
 SIZE = (6, 8)

@@ -6,9 +6,9 @@ import matplotlib
 import numpy as np
 import pytest
 
-from jaxtrapolate import latency
 from jaxtrapolate.latency import additional_lag, presentation_latency, simulate, summarize
-from jaxtrapolate.report.timeline import plot_latency
+from jaxtrapolate.latency import timeline as latency
+from jaxtrapolate.latency.plot import plot_latency
 
 LATE = np.array([18.0, 18, 26, 18, 18])
 

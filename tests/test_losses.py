@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from oracles import assert_gradients, random
 
-from jaxtrapolate.losses import charbonnier_loss, extranet_loss, hole_loss, l1_loss, relative_loss, shading_loss
+from jaxtrapolate.training.losses import (
+    charbonnier_loss,
+    extranet_loss,
+    hole_loss,
+    l1_loss,
+    relative_loss,
+    shading_loss,
+)
 
 
 def images(height, width, seed=0):

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc
 PROGRAM = """
 import sys
 import numpy as np
-from jaxtrapolate.memory import keep_memory, memory_kept
+from jaxtrapolate.runtime.memory import keep_memory, memory_kept
 
 def resident():
     with open("/proc/self/statm") as file:

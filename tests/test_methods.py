@@ -7,7 +7,7 @@ import pytest
 from synthetic import PAN, make_frame
 
 import jaxtrapolate as jx
-from jaxtrapolate.evaluation import hide
+from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.methods.hindsight import plain_share
 from jaxtrapolate.methods.stages import chain
 from jaxtrapolate.records import replace
@@ -205,7 +205,7 @@ def test_the_sky_is_taken_where_the_engine_draws_it(methods):
     ("name", "least"), [("repeat", 22.8), ("warp", 27.1), ("occlusion_warp", 29.2), ("guided_warp", 30.2)]
 )
 def test_known_figures_of_a_path_traced_clip(data, name, least):
-    from jaxtrapolate.evaluation import arguments, windows
+    from jaxtrapolate.evaluation.windows import arguments, windows
     from jaxtrapolate.files import open_sequence
 
     sequence = open_sequence(data / "czest1dm")

@@ -10,10 +10,10 @@ import sys
 import pytest
 from synthetic import SyntheticSequence
 
-from jaxtrapolate import output as module
-from jaxtrapolate.files import InputError
-from jaxtrapolate.files.atomic import atomic_path, sweep
-from jaxtrapolate.output import RECORD, differences, open_output, read_json, write_json
+from jaxtrapolate.atomic import atomic_path, sweep
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.runtime import output as module
+from jaxtrapolate.runtime.output import RECORD, differences, open_output, read_json, write_json
 
 
 class Files(SyntheticSequence):
@@ -167,8 +167,8 @@ def test_parts_are_merged(tmp_path):
 
 HOLD = """
 import sys, time
-from jaxtrapolate.files.atomic import atomic_path
-from jaxtrapolate.output import open_output
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.runtime.output import open_output
 with open_output(sys.argv[1], "generate", {"method": "warp"}) as output, atomic_path(output.folder / "0000.exr"):
     print("ready", flush=True)
     time.sleep(60)

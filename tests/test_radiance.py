@@ -9,8 +9,8 @@ import skimage.color
 from oracles import random
 
 import jaxtrapolate as jx
-from jaxtrapolate import radiance
-from jaxtrapolate.radiance import compress, expand
+from jaxtrapolate.ops import radiance
+from jaxtrapolate.ops.radiance import compress, expand
 from jaxtrapolate.records import replace
 
 SIZE = (5, 7)

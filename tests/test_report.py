@@ -17,8 +17,9 @@ import pytest
 from PIL import Image
 
 from jaxtrapolate import report
-from jaxtrapolate.causes import CAUSES
-from jaxtrapolate.files import InputError, write_png
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.files import write_png
+from jaxtrapolate.ops.causes import CAUSES
 from jaxtrapolate.report import values
 from jaxtrapolate.report.pictures import Pictures
 

@@ -21,20 +21,23 @@ import test_api
 from toy_task import ToyOptions, ToyTask
 
 import jaxtrapolate as jx
-from jaxtrapolate import causes, fill, grid, guided, holes, losses, metrics, radiance, scenes, search
+from jaxtrapolate import scenes
+from jaxtrapolate.bidirectional import search
 from jaxtrapolate.commands.main import main
-from jaxtrapolate.evaluation import hide
+from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.files import write_unreal_frame
 from jaxtrapolate.methods.extranet import extranet
 from jaxtrapolate.methods.interpolator import interpolator
+from jaxtrapolate.metrics import image as metrics
 from jaxtrapolate.networks import Interpolator, InterpolatorConfig
 from jaxtrapolate.networks.extranet import ExtraNetConfig
+from jaxtrapolate.ops import causes, fill, grid, guided, holes, radiance
 from jaxtrapolate.precision import widest
 from jaxtrapolate.records import replace
 from jaxtrapolate.scenes.scene import Builder, material, path
 from jaxtrapolate.scenes.shading import lamp_levels
 from jaxtrapolate.scenes.worlds import common
-from jaxtrapolate.training import Config, Optimizer
+from jaxtrapolate.training import Config, Optimizer, losses
 from jaxtrapolate.training.step import make_step
 from jaxtrapolate.training.tasks import round_key
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from oracles import random
 
-from jaxtrapolate.strips import by_strips, once, rows_of
+from jaxtrapolate.ops.strips import by_strips, once, rows_of
 
 pytestmark = pytest.mark.usefixtures("strict")
 

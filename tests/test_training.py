@@ -18,7 +18,8 @@ import pytest
 from flax import nnx
 from toy_task import MAP, SHIFT, ToyOptions, ToyTask
 
-from jaxtrapolate.files import InputError, read_png
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.files import read_png
 from jaxtrapolate.training import (
     Config,
     Optimizer,

@@ -8,7 +8,7 @@ from oracles import look, perspective, random
 from synthetic import make_frame
 
 import jaxtrapolate as jx
-from jaxtrapolate.evaluation import Window, hide
+from jaxtrapolate.evaluation.windows import Window, hide
 from jaxtrapolate.training.augment import crop, flip
 
 SIZE = (9, 14)

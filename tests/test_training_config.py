@@ -4,7 +4,7 @@ import pytest
 from toy_task import ToyOptions
 
 from jaxtrapolate.commands.main import main
-from jaxtrapolate.files import InputError
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.training import Optimizer, config_names, load_config, parse_config
 from jaxtrapolate.weights import load_orbax
 

@@ -12,8 +12,9 @@ from scipy import ndimage
 from synthetic import make_frame
 
 import jaxtrapolate as jx
-from jaxtrapolate.evaluation import Window, hide
-from jaxtrapolate.files import InputError, write_unreal_frame
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.evaluation.windows import Window, hide
+from jaxtrapolate.files import write_unreal_frame
 from jaxtrapolate.methods.extranet import Preparation, extranet
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
 from jaxtrapolate.records import replace

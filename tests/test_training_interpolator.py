@@ -11,7 +11,7 @@ from synthetic import make_frame
 
 import jaxtrapolate as jx
 from jaxtrapolate.commands.main import main
-from jaxtrapolate.evaluation import Window, hide
+from jaxtrapolate.evaluation.windows import Window, hide
 from jaxtrapolate.methods.interpolator import interpolator
 from jaxtrapolate.networks import Interpolator, InterpolatorConfig
 from jaxtrapolate.records import replace

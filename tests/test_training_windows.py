@@ -12,9 +12,10 @@ from flax import nnx
 from synthetic import make_frame, make_keyframe
 
 import jaxtrapolate as jx
-from jaxtrapolate.evaluation import Window, arguments, hide
-from jaxtrapolate.evaluation import windows as windows_of
-from jaxtrapolate.files import InputError, open_sequence, write_unreal_frame
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.evaluation.windows import Window, arguments, hide
+from jaxtrapolate.evaluation.windows import windows as windows_of
+from jaxtrapolate.files import open_sequence, write_unreal_frame
 from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence, flow, scene
 from jaxtrapolate.training import Config, Optimizer, train_and_evaluate
 from jaxtrapolate.training import windows as module

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from jaxtrapolate import report
-from jaxtrapolate.files import InputError
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.report import side_by_side, write_video
 
 COLORS = np.uint8([[200, 30, 40], [20, 180, 60], [40, 60, 220]])

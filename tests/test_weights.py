@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from torch_files import Named, Writer, pickled, tensor, write
 
 from jaxtrapolate import weights
-from jaxtrapolate.files import InputError
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.methods.extranet import load_extranet
 from jaxtrapolate.weights.pickled import read_pickle
 from jaxtrapolate.weights.tree import nested

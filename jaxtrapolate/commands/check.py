@@ -13,14 +13,15 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxtrapolate.commands.inputs import add_input, open_input, open_methods, progress, terminal
-from jaxtrapolate.ego_motion import camera_matrix, off_camera, static_ids
-from jaxtrapolate.evaluation import arguments, display, held_back, windows
+from jaxtrapolate.evaluation.score import display
+from jaxtrapolate.evaluation.windows import arguments, held_back, windows
 from jaxtrapolate.files import SETTINGS_NAME, MotionConvention, Sequence, gaps, prefetch, runs
-from jaxtrapolate.gather import backward_warp
 from jaxtrapolate.methods import method_names
 from jaxtrapolate.methods.method import buffer
-from jaxtrapolate.motion import Sign, Units, YAxis, convert_motion
-from jaxtrapolate.records import CHANNELS, Frame
+from jaxtrapolate.ops.ego_motion import camera_matrix, off_camera, static_ids
+from jaxtrapolate.ops.motion import convert_motion
+from jaxtrapolate.ops.warp import backward_warp
+from jaxtrapolate.records import CHANNELS, Frame, Sign, Units, YAxis
 
 _SCANNED = 20  # frames whose buffers are read
 _WATCHED = 8  # frames in which objects are compared to the camera

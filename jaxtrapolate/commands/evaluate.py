@@ -26,30 +26,22 @@ from jaxtrapolate.commands.inputs import (
     terminal,
 )
 from jaxtrapolate.commands.many import evaluate_many
-from jaxtrapolate.commands.pictures import write_pictures
-from jaxtrapolate.commands.runnable import history_costs, runnable
-from jaxtrapolate.commands.scores import Scores
 from jaxtrapolate.commands.tables import decibels, print_table
 from jaxtrapolate.commands.video import Video
-from jaxtrapolate.evaluation import (
-    DEFAULT_METRICS,
-    Window,
-    arguments,
-    causes_of,
-    display,
-    held_back,
-    mean_over_frames,
-    score,
-    time_stages,
-    windows,
-)
-from jaxtrapolate.files import InputError, Sequence, gaps, runs
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.evaluation.pictures import write_pictures
+from jaxtrapolate.evaluation.resume import Scores
+from jaxtrapolate.evaluation.runnable import history_costs, runnable
+from jaxtrapolate.evaluation.score import DEFAULT_METRICS, causes_of, display, mean_over_frames, score
+from jaxtrapolate.evaluation.stages import time_stages
+from jaxtrapolate.evaluation.windows import Window, arguments, held_back, windows
+from jaxtrapolate.files import Sequence, gaps, runs
 from jaxtrapolate.methods import Method, method_names
 from jaxtrapolate.metrics import Metric, metric_names
 from jaxtrapolate.metrics import load as load_metric
-from jaxtrapolate.output import Output, code, open_output, read_json, writable_folder, write_json
 from jaxtrapolate.report import write_report
-from jaxtrapolate.timing import machine
+from jaxtrapolate.runtime.output import Output, code, open_output, read_json, writable_folder, write_json
+from jaxtrapolate.runtime.timing import machine
 from jaxtrapolate.weights import fingerprint
 
 
@@ -135,8 +127,9 @@ def evaluate(
     """Scores methods on a sequence; writes results.json, pictures and report.html to `folder`, and returns the results.
 
     The scores of each frame are kept in `folder/scores` as they come, so that a run that was killed goes on where it
-    was, and a run with other methods, metrics or frames computes what is not there yet; see `jaxtrapolate.output` for
-    what has to be equal. `unavailable` says of methods that were asked for and cannot be had why. `fresh` starts anew.
+    was, and a run with other methods, metrics or frames computes what is not there yet; see
+    `jaxtrapolate.runtime.output` for what has to be equal.
+    `unavailable` says of methods that were asked for and cannot be had why. `fresh` starts anew.
     With `reuse`, results of the same request that are there already are returned as they are.
     """
     metrics = {n: load_metric(n) for n in DEFAULT_METRICS} if metrics is None else metrics

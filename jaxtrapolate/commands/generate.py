@@ -21,13 +21,14 @@ from jaxtrapolate.commands.inputs import (
     progress,
     terminal,
 )
-from jaxtrapolate.files import InputError, Sequence, runs, write_frame
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.files import Sequence, runs, write_frame
 from jaxtrapolate.files.reader import stored_size
-from jaxtrapolate.frame_forecast import forecast
 from jaxtrapolate.methods import BEST_FIRST, method_names
 from jaxtrapolate.methods.method import Frames, Method, neighbours, rendered
-from jaxtrapolate.output import open_output, write_json
+from jaxtrapolate.ops.forecast import forecast
 from jaxtrapolate.records import Frame, replace
+from jaxtrapolate.runtime.output import open_output, write_json
 from jaxtrapolate.weights import fingerprint
 
 

@@ -8,9 +8,9 @@ import jax
 import numpy as np
 from flax import nnx
 
+from jaxtrapolate.atomic import os_input_error
 from jaxtrapolate.commands.inputs import terminal
-from jaxtrapolate.files import InputError
-from jaxtrapolate.files.atomic import os_input_error
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.methods import load
 from jaxtrapolate.methods.extranet import extranet_config, load_extranet
 from jaxtrapolate.weights import load_orbax, save_weights

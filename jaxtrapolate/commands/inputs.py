@@ -11,8 +11,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from jaxtrapolate.files import InputError, Sequence, open_sequence
-from jaxtrapolate.files.atomic import os_input_error
+from jaxtrapolate.atomic import os_input_error
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.files import Sequence, open_sequence
 from jaxtrapolate.files.listing import folder_name
 from jaxtrapolate.methods import Method, load, method_names
 from jaxtrapolate.metrics import Metric, metric_names

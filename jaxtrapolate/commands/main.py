@@ -30,7 +30,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; 0, or 2 after one line on stderr about input that cannot be used, 130 after Ctrl-C."""
     options = parser().parse_args(arguments)
-    from jaxtrapolate.memory import keep_memory
+    from jaxtrapolate.runtime.memory import keep_memory
 
     keep_memory()
     for stream in (sys.stdout, sys.stderr):
@@ -46,8 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from jaxtrapolate.files import InputError
-    from jaxtrapolate.files.atomic import known_os_error, os_input_error
+    from jaxtrapolate.atomic import known_os_error, os_input_error
+    from jaxtrapolate.errors import InputError
 
     try:
         status = options.run(options) or 0

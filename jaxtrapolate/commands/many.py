@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from jaxtrapolate.commands.inputs import Input, Step
-from jaxtrapolate.evaluation import mean_over_inputs
-from jaxtrapolate.files import InputError
-from jaxtrapolate.output import open_output, write_json
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.evaluation.score import mean_over_inputs
 from jaxtrapolate.report import write_report
-from jaxtrapolate.timing import machine
+from jaxtrapolate.runtime.output import open_output, write_json
+from jaxtrapolate.runtime.timing import machine
 
 
 def evaluate_many(

@@ -6,7 +6,7 @@ from typing import Any
 from rich.table import Table
 
 from jaxtrapolate.commands.inputs import terminal
-from jaxtrapolate.files import InputError
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.methods import Method, load, method_description, method_names
 
 

@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from jaxtrapolate.commands.inputs import add_fresh, check_count, check_seed, parse_size, progress, terminal
-from jaxtrapolate.files import InputError, write_unreal_frame
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.files import write_unreal_frame
 from jaxtrapolate.files.listing import list_folder
 from jaxtrapolate.files.reader import stored_size
 from jaxtrapolate.files.unreal import unreal_files
-from jaxtrapolate.output import open_output
+from jaxtrapolate.runtime.output import open_output
 
 
 def add_parser(subparsers: Any) -> None:

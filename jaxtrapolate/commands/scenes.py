@@ -9,9 +9,9 @@ from typing import Any
 
 from rich.text import Text
 
+from jaxtrapolate.atomic import atomic_path
 from jaxtrapolate.commands.inputs import parse_size, progress, terminal
-from jaxtrapolate.files import InputError
-from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.errors import InputError
 
 
 def add_parser(subparsers: Any) -> None:

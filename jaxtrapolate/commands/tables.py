@@ -6,7 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from jaxtrapolate.causes import CAUSES
+from jaxtrapolate.ops.causes import CAUSES
 from jaxtrapolate.report.values import metric_label, metric_text, number
 
 

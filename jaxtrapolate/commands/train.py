@@ -6,7 +6,7 @@ import tomllib
 from typing import Any
 
 from jaxtrapolate.commands.inputs import add_fresh, steps, terminal
-from jaxtrapolate.files import InputError
+from jaxtrapolate.errors import InputError
 
 
 def add_parser(subparsers: Any) -> None:

@@ -11,12 +11,14 @@ from PIL import Image
 
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.commands.inputs import Step
-from jaxtrapolate.commands.pictures import eight_bit
-from jaxtrapolate.evaluation import arguments, display, windows
-from jaxtrapolate.files import InputError, Sequence
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.evaluation.pictures import eight_bit
+from jaxtrapolate.evaluation.score import display
+from jaxtrapolate.evaluation.windows import arguments, windows
+from jaxtrapolate.files import Sequence
 from jaxtrapolate.methods import Method
-from jaxtrapolate.output import writable_folder
 from jaxtrapolate.report import VIDEO_FORMATS, check_video_format, side_by_side, write_video
+from jaxtrapolate.runtime.output import writable_folder
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,6 +10,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from jaxtrapolate.errors import InputError as InputError
 from jaxtrapolate.files.description import SETTINGS_NAME as SETTINGS_NAME
 from jaxtrapolate.files.description import read_settings
 from jaxtrapolate.files.exr import read_exr as read_exr
@@ -24,7 +25,6 @@ from jaxtrapolate.files.packed import packed_folder
 from jaxtrapolate.files.pattern import PatternSequence as PatternSequence
 from jaxtrapolate.files.prefetch import prefetch as prefetch
 from jaxtrapolate.files.reader import FileSequence
-from jaxtrapolate.files.sequence import InputError as InputError
 from jaxtrapolate.files.sequence import MotionConvention as MotionConvention
 from jaxtrapolate.files.sequence import Sequence as Sequence
 from jaxtrapolate.files.unreal import CONVENTION as _UNREAL

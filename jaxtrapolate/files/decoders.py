@@ -26,11 +26,11 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from jaxtrapolate.files.atomic import os_input_error
+from jaxtrapolate.atomic import os_input_error
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.files.limits import check_claim, check_pixels
-from jaxtrapolate.files.regular import open_regular
-from jaxtrapolate.files.sequence import InputError
 from jaxtrapolate.files.silence import silence
+from jaxtrapolate.regular import open_regular
 
 KINDS = "PNG, JPEG, BMP, TGA, TIFF, Radiance HDR, .flo or .npy"
 _STORE = "store it as EXR or PNG"

@@ -80,11 +80,12 @@ from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.files.ids import StaticId, hexadecimal
 from jaxtrapolate.files.reader import BUFFERS
-from jaxtrapolate.files.sequence import InputError, MotionConvention
+from jaxtrapolate.files.sequence import MotionConvention
 from jaxtrapolate.files.text import BACKSLASH, read_toml
-from jaxtrapolate.motion import Sign, Units, YAxis
+from jaxtrapolate.records import Sign, Units, YAxis
 
 SETTINGS_NAME = "jaxtrapolate.toml"
 """The name of the TOML file in a folder of frames."""

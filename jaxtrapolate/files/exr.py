@@ -17,10 +17,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxtrapolate.atomic import atomic_path, os_input_error
 from jaxtrapolate.checks import check_choice
-from jaxtrapolate.files.atomic import atomic_path, os_input_error
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.files.exr_header import ExrPart, check_limits, read_header
-from jaxtrapolate.files.sequence import InputError
 from jaxtrapolate.files.silence import silence
 
 Compression = Literal["none", "rle", "zips", "zip", "piz"]

@@ -13,10 +13,10 @@ from typing import BinaryIO
 
 import numpy as np
 
-from jaxtrapolate.files.atomic import os_input_error
+from jaxtrapolate.atomic import os_input_error
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.files.limits import check_claim, check_pixels
-from jaxtrapolate.files.regular import open_regular
-from jaxtrapolate.files.sequence import InputError
+from jaxtrapolate.regular import open_regular
 
 _MAGIC = 20000630
 _TILED, _DEEP, _MULTIPART = 0x200, 0x800, 0x1000

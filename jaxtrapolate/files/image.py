@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.files.decoders import ImageHeader, decode
 from jaxtrapolate.files.exr import write_exr
-from jaxtrapolate.files.sequence import InputError
 
 _MODES = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}
 

@@ -11,7 +11,7 @@ It is looked up whenever a file is opened. All channels of a file together may h
 
 import os
 
-from jaxtrapolate.files.sequence import InputError
+from jaxtrapolate.errors import InputError
 
 VARIABLE = "JAXTRAPOLATE_MAX_PIXELS"
 MAX_PIXELS = 40_000_000

@@ -7,8 +7,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from jaxtrapolate.files.atomic import os_input_error
-from jaxtrapolate.files.sequence import InputError
+from jaxtrapolate.atomic import os_input_error
+from jaxtrapolate.errors import InputError
 
 Files = dict[int, dict[str, str]]
 """For each frame the file of each buffer, relative to the sequence's folder."""

@@ -21,12 +21,13 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.files.alpha import without_empty
 from jaxtrapolate.files.ids import StaticId
 from jaxtrapolate.files.image import decode_srgb, read_png
 from jaxtrapolate.files.listing import collect, folder_name, frame_number, list_folder, some
 from jaxtrapolate.files.reader import FileSequence, Opened
-from jaxtrapolate.files.sequence import InputError, MotionConvention
+from jaxtrapolate.files.sequence import MotionConvention
 
 FOLDERS = ("color", "motion", "depth", "stencil", "shadow")
 CONVENTION = MotionConvention("current_minus_previous", "uv", "up")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.files.alpha import without_empty
 from jaxtrapolate.files.decoders import ImageHeader
 from jaxtrapolate.files.description import FIELD, SETTINGS_NAME, Buffer, Settings, read_settings
@@ -16,7 +17,7 @@ from jaxtrapolate.files.ids import color_ids
 from jaxtrapolate.files.image import decode_srgb, image_header, read_image
 from jaxtrapolate.files.listing import Files, collect, folder_name, frame_number, list_folder, some
 from jaxtrapolate.files.reader import BUFFERS, GREY, FileSequence, Opened, is_exr, pick_channels
-from jaxtrapolate.files.sequence import InputError, MotionConvention
+from jaxtrapolate.files.sequence import MotionConvention
 
 
 class PatternSequence(FileSequence):

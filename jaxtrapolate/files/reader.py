@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxtrapolate.checks import Size
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.files.alpha import UNWRITTEN_NOTE, alpha_note, exr_alpha, without_empty
 from jaxtrapolate.files.convention import convert
 from jaxtrapolate.files.exr import exr_outside, exr_size, layer_channels, pick
@@ -24,7 +25,7 @@ from jaxtrapolate.files.ids import Numbering, StaticId, clear_static, distinct, 
 from jaxtrapolate.files.image import image_size
 from jaxtrapolate.files.listing import find_step
 from jaxtrapolate.files.repair import fill_nearest, no_depth, nonfinite_pixels, repair
-from jaxtrapolate.files.sequence import InputError, MotionConvention, Sequence
+from jaxtrapolate.files.sequence import MotionConvention, Sequence
 from jaxtrapolate.records import CHANNELS, Frame, GBuffer, Keyframe
 
 BUFFERS: dict[str, int] = {"color": 3, "motion": 2, **CHANNELS, "forward_flow": 3, "backward_flow": 3}

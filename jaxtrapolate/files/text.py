@@ -7,9 +7,9 @@ import tomllib
 from collections.abc import Callable
 from typing import Any
 
-from jaxtrapolate.files.atomic import os_input_error
-from jaxtrapolate.files.regular import open_regular
-from jaxtrapolate.files.sequence import InputError
+from jaxtrapolate.atomic import os_input_error
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.regular import open_regular
 
 LARGEST = 1 << 20
 """Bytes: no file of settings is larger."""

@@ -32,14 +32,15 @@ from typing import Any
 
 import numpy as np
 
-from jaxtrapolate.files.atomic import os_input_error
+from jaxtrapolate.atomic import os_input_error
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.files.convention import unconvert
 from jaxtrapolate.files.exr import read_exr, write_exr
 from jaxtrapolate.files.ids import StaticId
 from jaxtrapolate.files.listing import Files, collect, folder_name, frame_number, list_folder, some
 from jaxtrapolate.files.reader import BUFFERS, FLOWS, FileSequence, Opened, pick_channels
 from jaxtrapolate.files.repair import nothing_hit
-from jaxtrapolate.files.sequence import InputError, MotionConvention
+from jaxtrapolate.files.sequence import MotionConvention
 from jaxtrapolate.records import Frame, Keyframe, check_frame
 
 NAMES = {

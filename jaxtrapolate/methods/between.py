@@ -8,7 +8,7 @@ the flows between the two, each on its own frame's grid.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxtrapolate.flows import complete_flows
+from jaxtrapolate.bidirectional.flows import complete_flows
 from jaxtrapolate.methods.method import Frames, Stage, Values, rendered, upcoming
 from jaxtrapolate.methods.stages import chain
 from jaxtrapolate.precision import widest

@@ -10,20 +10,20 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxtrapolate.assisted import DepthKind
-from jaxtrapolate.bidirectional import interpolate_bidirectional
+from jaxtrapolate.bidirectional.assisted import DepthKind
+from jaxtrapolate.bidirectional.flows import complete_flows
+from jaxtrapolate.bidirectional.interpolate import interpolate_bidirectional
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.depth import apart as depth_apart
-from jaxtrapolate.depth import held
-from jaxtrapolate.flows import complete_flows
-from jaxtrapolate.gather import backward_warp, in_frame, pixel_grid, sample
 from jaxtrapolate.methods.between import BETWEEN, CHAINED, PAIR, depth_of
 from jaxtrapolate.methods.method import Method, Stage, Values, rendered, upcoming
 from jaxtrapolate.methods.stages import SKY, chain, find_holes
 from jaxtrapolate.methods.warping import fetch_guided, guides_of
-from jaxtrapolate.motion import camera_motion
+from jaxtrapolate.ops.depth import apart as depth_apart
+from jaxtrapolate.ops.depth import held
+from jaxtrapolate.ops.motion import camera_motion
+from jaxtrapolate.ops.radiance import By, compress, demodulate, expand, modulate
+from jaxtrapolate.ops.warp import backward_warp, in_frame, pixel_grid, sample
 from jaxtrapolate.precision import widest
-from jaxtrapolate.radiance import By, compress, demodulate, expand, modulate
 from jaxtrapolate.records import Frame, Keyframe, replace
 
 _BLOCK = 8  # pixels, the side of the blocks over which differences are averaged

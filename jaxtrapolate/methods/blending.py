@@ -3,13 +3,13 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxtrapolate.assisted import blend as mix
-from jaxtrapolate.fill import fill_pyramid
-from jaxtrapolate.gather import backward_warp
+from jaxtrapolate.bidirectional.assisted import blend as mix
 from jaxtrapolate.methods.between import BETWEEN, FLOWS, PAIR, depth_of
 from jaxtrapolate.methods.method import Method, Stage, Values
-from jaxtrapolate.radiance import tonemap
-from jaxtrapolate.scatter import splat
+from jaxtrapolate.ops.fill import fill_pyramid
+from jaxtrapolate.ops.radiance import tonemap
+from jaxtrapolate.ops.scatter import splat
+from jaxtrapolate.ops.warp import backward_warp
 
 _BY_DEPTH = 5.0  # exponents at infinite depth; this and the next by mean dB on embedded scenes
 _BY_COLOR = 10.0  # exponents per difference of display values; the authors' release starts from 20

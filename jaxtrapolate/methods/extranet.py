@@ -16,10 +16,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_choice
-from jaxtrapolate.depth import surface_depth
-from jaxtrapolate.files.sequence import printable
-from jaxtrapolate.gather import backward_warp
-from jaxtrapolate.holes import Taps
+from jaxtrapolate.errors import printable
 from jaxtrapolate.methods.method import Method, Stage, Values, rendered
 from jaxtrapolate.methods.stages import (
     OCCLUSION,
@@ -36,8 +33,11 @@ from jaxtrapolate.methods.warping import guided_stage
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig, extranet_from_torch
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.networks.stored import load_network
+from jaxtrapolate.ops.depth import surface_depth
+from jaxtrapolate.ops.holes import Taps
+from jaxtrapolate.ops.radiance import By, demodulate, log_decode, log_encode
+from jaxtrapolate.ops.warp import backward_warp
 from jaxtrapolate.precision import widest
-from jaxtrapolate.radiance import By, demodulate, log_decode, log_encode
 from jaxtrapolate.records import GBuffer
 from jaxtrapolate.weights import configured, read_torch
 

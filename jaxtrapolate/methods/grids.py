@@ -1,13 +1,13 @@
 """Baselines that warp a coarse grid laid over a rendered frame, its colour as it is: nothing is demodulated.
 
-The papers' warps go forward from one frame; see `jaxtrapolate.grid.grid_warp` for what departs from them.
+The papers' warps go forward from one frame; see `jaxtrapolate.ops.grid.grid_warp` for what departs from them.
 """
 
-from jaxtrapolate.fill import fill_pyramid
-from jaxtrapolate.grid import grid_warp as warp_grid
 from jaxtrapolate.methods.between import BETWEEN, FLOWS, PAIR, depth_of
 from jaxtrapolate.methods.method import Method, Stage, Values
 from jaxtrapolate.methods.reprojection import CAMERA, LINEAR, NEWEST, ONWARD_NEEDS, carried_depth
+from jaxtrapolate.ops.fill import fill_pyramid
+from jaxtrapolate.ops.grid import grid_warp as warp_grid
 
 _CELL = 4  # pixels: stands for the refinement near silhouettes, which a uniform grid has not
 

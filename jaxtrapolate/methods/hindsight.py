@@ -14,10 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.gather import backward_warp, landing, sample
 from jaxtrapolate.methods.method import Stage, Values, rendered
 from jaxtrapolate.methods.stages import chain
-from jaxtrapolate.radiance import By, compress, demodulate, modulate
+from jaxtrapolate.ops.radiance import By, compress, demodulate, modulate
+from jaxtrapolate.ops.warp import backward_warp, landing, sample
 from jaxtrapolate.records import Frame
 
 _BLOCK = 8  # pixels, the side of the blocks over which errors are averaged

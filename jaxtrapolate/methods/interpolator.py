@@ -12,7 +12,7 @@ from jaxtrapolate.methods.method import Method, Stage, Values
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.networks.interpolator import Interpolator, InterpolatorConfig
 from jaxtrapolate.networks.stored import load_network
-from jaxtrapolate.radiance import compress, expand
+from jaxtrapolate.ops.radiance import compress, expand
 from jaxtrapolate.weights import configured
 
 _NAME = "interpolator"

@@ -18,7 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import missing_package
-from jaxtrapolate.depth import surfaces
+from jaxtrapolate.ops.depth import surfaces
 from jaxtrapolate.records import Frame, check_frame
 
 Values = Mapping[str, Any]
@@ -143,7 +143,7 @@ class Method:
     sequence whose motion leads from frame to frame, that is every frame from the oldest to the newest that is taken,
     with colour or without; `neighbours` says which. That cannot be checked here: times are traced, and need not be
     there. What a frame shows of nothing (depth that is not positive or infinite, or the sky) is far in every stage, see
-    `jaxtrapolate.depth`.
+    `jaxtrapolate.ops.depth`.
 
     Attributes:
         name: as `jaxtrapolate.load` knows it.

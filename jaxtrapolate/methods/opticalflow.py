@@ -7,13 +7,13 @@ compiled like those of any method.
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrapolate.assisted import blend as mix
+from jaxtrapolate.bidirectional.assisted import blend as mix
 from jaxtrapolate.checks import ArrayLike
-from jaxtrapolate.gather import backward_warp
 from jaxtrapolate.methods.between import PAIR
 from jaxtrapolate.methods.blending import evenly
 from jaxtrapolate.methods.method import Method, Stage, Values
-from jaxtrapolate.radiance import srgb_encode, tonemap
+from jaxtrapolate.ops.radiance import srgb_encode, tonemap
+from jaxtrapolate.ops.warp import backward_warp
 
 _LEAST = 32  # pixels: smaller images are padded
 

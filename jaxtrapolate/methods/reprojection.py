@@ -8,17 +8,17 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxtrapolate.assisted import agree
-from jaxtrapolate.depth import changed
-from jaxtrapolate.fill import fill_around
-from jaxtrapolate.flows import camera_flow
-from jaxtrapolate.gather import backward_warp, in_frame
+from jaxtrapolate.bidirectional.assisted import agree
+from jaxtrapolate.bidirectional.flows import camera_flow
 from jaxtrapolate.methods.between import depth_of
 from jaxtrapolate.methods.method import Frames, Method, Stage, Values, rendered
 from jaxtrapolate.methods.stages import REPROJECT, SKY
+from jaxtrapolate.ops.depth import changed
+from jaxtrapolate.ops.fill import fill_around
+from jaxtrapolate.ops.scatter import splat_nearest
+from jaxtrapolate.ops.warp import backward_warp, in_frame
 from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Frame
-from jaxtrapolate.scatter import splat_nearest
 
 Shade = Callable[[Frame, Bool[Array, "h w"]], Float[Array, "h w 3"]]
 """What a renderer does on a cache miss: colours `[H, W, 3]` for a target, looked at where the mask `[H, W]` is True."""

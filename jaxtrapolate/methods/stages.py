@@ -15,11 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.gather import backward_warp
-from jaxtrapolate.holes import Taps, hole_masks
 from jaxtrapolate.methods.method import Stage, Values, rendered
-from jaxtrapolate.motion import chain_motion, occlusion_motion
-from jaxtrapolate.radiance import By, demodulate, modulate
+from jaxtrapolate.ops.holes import Taps, hole_masks
+from jaxtrapolate.ops.motion import chain_motion, occlusion_motion
+from jaxtrapolate.ops.radiance import By, demodulate, modulate
+from jaxtrapolate.ops.warp import backward_warp
 from jaxtrapolate.records import Frame, GBuffer, replace
 
 

@@ -2,8 +2,6 @@
 
 import jax.numpy as jnp
 
-from jaxtrapolate.gather import backward_warp
-from jaxtrapolate.guided import far_motion, guided_warp
 from jaxtrapolate.methods.hindsight import hindsight_stage
 from jaxtrapolate.methods.method import Method, Stage, Values, rendered
 from jaxtrapolate.methods.stages import (
@@ -16,6 +14,8 @@ from jaxtrapolate.methods.stages import (
     layers,
     modulate_stage,
 )
+from jaxtrapolate.ops.guided import far_motion, guided_warp
+from jaxtrapolate.ops.warp import backward_warp
 
 
 def repeat() -> Method:

@@ -18,8 +18,8 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_array
-from jaxtrapolate.gather import landing, sample
 from jaxtrapolate.networks.blocks import HE, Layer, double, pad_to_multiple, shuffle
+from jaxtrapolate.ops.warp import landing, sample
 from jaxtrapolate.precision import widest
 
 

@@ -4,7 +4,7 @@ import matplotlib
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from jaxtrapolate.causes import CAUSES
+from jaxtrapolate.ops.causes import CAUSES
 
 CAUSE_COLORS = {
     "border": "#009e73",
@@ -80,7 +80,7 @@ def colorize_causes(index_map: Int[Array | np.ndarray, "h w"]) -> UInt8[np.ndarr
     """A `cause_map` as a picture in the colours of `CAUSE_COLORS`, which the report's legend shows.
 
     Args:
-        index_map: `[H, W]`, indices into `jaxtrapolate.causes.CAUSES`.
+        index_map: `[H, W]`, indices into `jaxtrapolate.ops.causes.CAUSES`.
 
     Returns:
         `[H, W, 3]` uint8.

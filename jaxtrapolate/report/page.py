@@ -16,8 +16,8 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from jaxtrapolate.causes import CAUSES
-from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.ops.causes import CAUSES
 from jaxtrapolate.report import values
 from jaxtrapolate.report.colors import CAUSE_COLORS, CAUSE_TEXTS, ERROR_LIMIT, error_gradient
 from jaxtrapolate.report.pictures import Pictures

@@ -21,7 +21,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from matplotlib.transforms import Bbox, BboxBase
 
-from jaxtrapolate.causes import CAUSES
+from jaxtrapolate.ops.causes import CAUSES
 from jaxtrapolate.report.values import MethodResult, fixed, percent, read_methods
 
 _INK, _SOFT, _GRID = "#24292e", "#59616a", "#d5d9dd"

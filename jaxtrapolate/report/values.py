@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import quote
 
-from jaxtrapolate.causes import CAUSES
+from jaxtrapolate.ops.causes import CAUSES
 from jaxtrapolate.report.colors import method_style
 
 DASH = "–"

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from jaxtrapolate.files import InputError
-from jaxtrapolate.files.atomic import atomic_path
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.errors import InputError
 
 VIDEO_FORMATS = ("webp", "gif", "mp4")
 """The kinds of files that `write_video` writes, which are their suffixes."""

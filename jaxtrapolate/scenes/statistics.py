@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxtrapolate.gather import landing
+from jaxtrapolate.ops.warp import landing
 from jaxtrapolate.records import Frame
 from jaxtrapolate.scenes.render import flow, render, visible
 from jaxtrapolate.scenes.scene import Scene

@@ -18,8 +18,8 @@ import orbax.checkpoint as ocp
 from flax import nnx
 from orbax.checkpoint import checkpoint_managers as policies
 
-from jaxtrapolate.files.atomic import os_input_error
-from jaxtrapolate.files.sequence import InputError
+from jaxtrapolate.atomic import os_input_error
+from jaxtrapolate.errors import InputError
 
 
 class Checkpoints:

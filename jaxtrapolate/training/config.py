@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from importlib import resources
 from typing import Any, Literal, TypeVar
 
-from jaxtrapolate.files import InputError
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.files.text import read_toml
 from jaxtrapolate.training.tasks import Task, find_task
 

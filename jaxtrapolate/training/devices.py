@@ -8,7 +8,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from jaxtrapolate.files import InputError
+from jaxtrapolate.errors import InputError
 
 AXIS = "batch"
 """The name of the mesh's one axis."""

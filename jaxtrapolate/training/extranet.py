@@ -11,15 +11,15 @@ from flax import nnx
 from jaxtyping import Array, PRNGKeyArray
 
 from jaxtrapolate.checks import Size, check_present
-from jaxtrapolate.evaluation import Window
-from jaxtrapolate.losses import extranet_loss, relative_loss
+from jaxtrapolate.evaluation.windows import Window
 from jaxtrapolate.methods.extranet import Preparation, encoded_truth, extranet, extranet_config
 from jaxtrapolate.methods.stages import demodulated
 from jaxtrapolate.metrics import psnr
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
-from jaxtrapolate.radiance import demodulation_divisor, log_decode, tonemap
+from jaxtrapolate.ops.radiance import demodulation_divisor, log_decode, tonemap
 from jaxtrapolate.training.augment import crop
 from jaxtrapolate.training.config import check_range
+from jaxtrapolate.training.losses import extranet_loss, relative_loss
 from jaxtrapolate.training.tasks import Batch, Example
 from jaxtrapolate.training.windows import WindowOptions, Windows, check_crop, validated
 

@@ -10,14 +10,14 @@ from flax import nnx
 from jaxtyping import Array, PRNGKeyArray
 
 from jaxtrapolate.checks import Size, check_present
-from jaxtrapolate.evaluation import Window
-from jaxtrapolate.losses import charbonnier_loss
+from jaxtrapolate.evaluation.windows import Window
 from jaxtrapolate.methods.interpolator import interpolator, interpolator_config
 from jaxtrapolate.metrics import psnr
 from jaxtrapolate.networks.interpolator import Interpolator, InterpolatorConfig
-from jaxtrapolate.radiance import compress, expand, tonemap
+from jaxtrapolate.ops.radiance import compress, expand, tonemap
 from jaxtrapolate.training.augment import crop
 from jaxtrapolate.training.config import check_range
+from jaxtrapolate.training.losses import charbonnier_loss
 from jaxtrapolate.training.tasks import Batch, Example
 from jaxtrapolate.training.windows import WindowOptions, Windows, check_crop, validated
 

@@ -9,8 +9,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxtrapolate.atomic import atomic_path, os_input_error
 from jaxtrapolate.files import write_png
-from jaxtrapolate.files.atomic import atomic_path, os_input_error
 
 METRICS = "metrics.jsonl"
 """Name of the file of metrics: one JSON object a line, with "kind" ("train" or "validation") and "step"."""

@@ -10,9 +10,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxtrapolate.files import InputError
-from jaxtrapolate.files.atomic import os_input_error
-from jaxtrapolate.output import Output, code, differences, open_output
+from jaxtrapolate.atomic import os_input_error
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.runtime.output import Output, code, differences, open_output
 from jaxtrapolate.training import devices
 from jaxtrapolate.training.checkpoints import Checkpoints, save_model
 from jaxtrapolate.training.config import Config, make_task

@@ -17,9 +17,10 @@ from jax.sharding import AxisType, Mesh, PartitionSpec
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxtrapolate.checks import Size, check_choice
-from jaxtrapolate.evaluation import Window, hide
-from jaxtrapolate.evaluation import windows as windows_of
-from jaxtrapolate.files import InputError, Sequence, open_sequence, runs
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.evaluation.windows import Window, hide
+from jaxtrapolate.evaluation.windows import windows as windows_of
+from jaxtrapolate.files import Sequence, open_sequence, runs
 from jaxtrapolate.records import Frame, GBuffer, replace
 from jaxtrapolate.scenes import TRAINING_SEEDS, Scene, render, scene, scene_names, stack_scenes
 from jaxtrapolate.training.augment import flip

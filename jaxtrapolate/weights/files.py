@@ -17,10 +17,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxtrapolate.files.atomic import atomic_path
-from jaxtrapolate.files.regular import open_regular
-from jaxtrapolate.files.sequence import printable
+from jaxtrapolate.atomic import atomic_path
+from jaxtrapolate.errors import printable
 from jaxtrapolate.files.text import check_values
+from jaxtrapolate.regular import open_regular
 from jaxtrapolate.weights.tree import named, nested
 
 LARGEST = 2_000_000

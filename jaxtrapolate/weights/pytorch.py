@@ -8,8 +8,8 @@ from typing import Any, BinaryIO
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrapolate.files.regular import open_regular
-from jaxtrapolate.files.sequence import printable
+from jaxtrapolate.errors import printable
+from jaxtrapolate.regular import open_regular
 from jaxtrapolate.weights.pickled import Global, read_pickle
 
 _DTYPES = {

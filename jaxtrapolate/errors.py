@@ -1,0 +1,24 @@
+"""The error of input that cannot be used, whose message is for users, and text that any terminal can print."""
+
+_LONGEST = 2000
+
+
+class InputError(Exception):
+    """Input that cannot be used; the message is one line that names the file and the remedy.
+
+    It can be printed whatever a file's name or content is (`printable`).
+    """
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*(printable(arg) if isinstance(arg, str) else arg for arg in args))
+
+
+def printable(text: object) -> str:
+    r"""A text in one line that any terminal takes: what is not printable is escaped, the middle of a long one left out.
+
+    The bytes of a file's name that are no UTF-8 are shown as "\udcff", a line's end as "\n".
+    """
+    text = str(text)
+    if len(text) > _LONGEST:
+        text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
