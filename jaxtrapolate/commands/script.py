@@ -3,6 +3,7 @@
 From its first line on Ctrl-C ends it with one line and status 130, also while the rest is being imported.
 """
 
+import contextlib
 import os
 import signal
 import sys
@@ -22,7 +23,14 @@ def script() -> int:
     signal.signal(signal.SIGINT, end)
     from jaxtrapolate.commands.main import main
 
-    return main()
+    status = main()
+    if status == 130:  # at once: threads that still write complain where Python takes itself down beneath them
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+        with contextlib.suppress(OSError, ValueError):
+            sys.stderr.flush()
+        os._exit(status)
+    return status
 
 
 if __name__ == "__main__":
