@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.checks import ArrayLike, check_image
+from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Frame, Keyframe, replace
 
 _HELD = 1e30  # in place of infinity
@@ -80,7 +81,7 @@ def apart(first: Array, second: Array) -> Array:
 
     Where one is, more than any two surfaces, and the less the farther the other is: 1e30 / other. No gradient.
     """
-    wide = jnp.promote_types(first.dtype, second.dtype)
+    wide = widest(first, second)
     first, second = jax.lax.stop_gradient(tuple(held(a.astype(wide)) for a in (first, second)))
     near = jnp.minimum(first, second)
     one = (first < _HELD) != (second < _HELD)
@@ -92,7 +93,7 @@ def held(depth: Array) -> Array:
 
     Of a bilinear mixture of nothing and a surface it keeps how much of it is nothing, and its derivatives are finite.
     """
-    return jnp.minimum(depth.astype(jnp.promote_types(depth.dtype, jnp.float32)), _HELD)
+    return jnp.minimum(depth.astype(widest(depth)), _HELD)
 
 
 def released(depth: Array) -> Array:
