@@ -350,6 +350,15 @@ def test_alpha_of_an_exr(tmp_path, reader):
     np.testing.assert_array_equal(sequence.frame(2).color, image[..., :3])
 
 
+def test_alpha_of_signalling_nans_warns_of_nothing(tmp_path):
+    """Which raise a floating-point flag in sums over them; any number but 0 is alpha."""
+    image = np.ones((4, 5, 4), np.float32)
+    image[..., 3] = np.full((4, 5), 0x7F800001, np.uint32).view(np.float32)
+    folder(tmp_path, '[buffers]\ncolor = "{frame}.exr"\n')
+    write_exr(tmp_path / "1.exr", image, half=False)
+    np.testing.assert_array_equal(open_sequence(tmp_path).frame(1).color, image[..., :3])
+
+
 # -- limits
 
 

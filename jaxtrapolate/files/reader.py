@@ -136,7 +136,7 @@ class FileSequence(Sequence):
         Those outside the data window stay: nothing was hit there, which depth and the sky mask say.
         """
         alpha = exr_alpha(stored, self._color_layer)
-        if alpha is not None and not alpha.any():
+        if alpha is not None and not np.count_nonzero(alpha):
             if not self._unwritten:
                 self._note(UNWRITTEN_NOTE.format(name=path.name))
             self._unwritten = True
