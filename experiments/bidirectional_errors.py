@@ -43,11 +43,11 @@ BELOW = (0.1, 0.5, 1.0)
 VARIANTS = {
     "default": {},
     "nearest, error": {"choice": "error"},
-    "bilinear, depth": {"flow_filter": "bilinear"},
-    "bilinear, error (paper)": {"flow_filter": "bilinear", "choice": "error"},
-    "bilinear, newton, depth": {"flow_filter": "bilinear", "solver": "newton"},
-    "bilinear, newton, error": {"flow_filter": "bilinear", "solver": "newton", "choice": "error"},
-    "bilinear, depth, 6 steps": {"flow_filter": "bilinear", "iterations": 6},
+    "bilinear, depth": {"filter": "bilinear"},
+    "bilinear, error (paper)": {"filter": "bilinear", "choice": "error"},
+    "bilinear, newton, depth": {"filter": "bilinear", "solver": "newton"},
+    "bilinear, newton, error": {"filter": "bilinear", "solver": "newton", "choice": "error"},
+    "bilinear, depth, 6 steps": {"filter": "bilinear", "iterations": 6},
     "nearest, depth, 6 steps": {"iterations": 6},
 }
 EVERYWHERE = ("default", "bilinear, error (paper)")
@@ -139,8 +139,9 @@ def run(previous: jx.Keyframe, following: jx.Keyframe, truths: list, n: int, opt
     far, none = jnp.full((*SIZE[0], 1), jnp.inf), jnp.zeros((*SIZE[0], 2))
     offsets = jx.Offsets(jnp.float32(0.5), none, none, far, far)  # of no frame yet
     sums = np.zeros((len(KINDS), len(BELOW) + 1))
+    search = jx.SearchOptions(**options)
     for k, (exact, seen) in enumerate(truths, 1):
-        made = jx.interpolate_bidirectional(previous, following, k / n, offsets=offsets, **options)
+        made = jx.interpolate_bidirectional(previous, following, k / n, offsets=offsets, search=search)
         offsets = made.offsets
         sums += np.asarray(total_counts(made, exact, seen), float)
     return sums

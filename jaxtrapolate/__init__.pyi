@@ -15,7 +15,10 @@ from .bidirectional.assisted import overlay as overlay
 from .bidirectional.flows import CompletedFlows as CompletedFlows
 from .bidirectional.flows import camera_flow as camera_flow
 from .bidirectional.flows import complete_flows as complete_flows
+from .bidirectional.image_based import interpolate_image_based as interpolate_image_based
 from .bidirectional.interpolate import interpolate_bidirectional as interpolate_bidirectional
+from .bidirectional.options import SearchOptions as SearchOptions
+from .bidirectional.options import VisibilityOptions as VisibilityOptions
 from .bidirectional.runs import interpolate_run as interpolate_run
 from .bidirectional.runs import motion_blur as motion_blur
 from .bidirectional.search import Correspondence as Correspondence

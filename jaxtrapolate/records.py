@@ -25,6 +25,10 @@ Units = Literal["pixels", "uv", "ndc"]
 YAxis = Literal["down", "up"]
 """How motion vectors may be stated: see `jaxtrapolate.convert_motion`."""
 
+DepthKind = Literal["metric", "ordinal"]
+"""What depth is: the distance along the view axis, or numbers of which only the order counts."""
+DepthOrAbsent = Literal["metric", "ordinal", "absent"]
+
 
 def record(cls: type[R]) -> type[R]:
     """Register a frozen dataclass as a pytree whose fields are all leaves or subtrees."""

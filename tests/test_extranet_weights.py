@@ -117,7 +117,7 @@ def test_weights_that_do_not_fit_are_refused(model, saved, tmp_path):
     refused("weights of method 'patchex', expected 'extranet'", method="patchex")
     refused(r"do not fit: decoder/0/layers/0/feature/bias is \[8\], expected \[9\]", network={"widths": [6, 6]})
     refused("missing merge/feature/bias", tree={k: v for k, v in given.tree.items() if k != "merge"})
-    refused("ExtraNetConfig has no depth", network={"depth": 4})
+    refused("ExtraNetConfig: depth: no such setting", network={"depth": 4})
     refused("Preparation: by: expected one of", preparation={"by": "colour"})
     path = tmp_path / "a.pth.tar"
     path.write_bytes(b"hello")

@@ -76,7 +76,7 @@ import os
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 
@@ -85,7 +85,7 @@ from jaxtrapolate.files.ids import StaticId, hexadecimal
 from jaxtrapolate.files.reader import BUFFERS
 from jaxtrapolate.files.sequence import MotionConvention
 from jaxtrapolate.files.text import BACKSLASH, read_toml
-from jaxtrapolate.records import Sign, Units, YAxis
+from jaxtrapolate.records import DepthKind, Sign, Units, YAxis
 
 SETTINGS_NAME = "jaxtrapolate.toml"
 """The name of the TOML file in a folder of frames."""
@@ -124,7 +124,7 @@ class Settings:
     motion: dict[str, str]
     name: str | None = None
     hdr: bool | None = None
-    depth: Literal["metric", "ordinal"] = "metric"
+    depth: DepthKind = "metric"
     step: int | None = None
     static_ids: tuple[StaticId, ...] = ()
 
@@ -144,7 +144,7 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
     kinds = {
         "name": _text,
         "hdr": _flag,
-        "depth": _choice("metric", "ordinal"),
+        "depth": _choice(*get_args(DepthKind)),
         "step": _step,
         "static_ids": _static,
         "motion": _table,

@@ -7,12 +7,12 @@ import abc
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from jaxtrapolate.errors import InputError
-from jaxtrapolate.records import Frame, Keyframe, Sign, Units, YAxis
+from jaxtrapolate.records import DepthOrAbsent, Frame, Keyframe, Sign, Units, YAxis
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Sequence(abc.ABC):
     size: tuple[int, int]
     hdr: bool
     convention: MotionConvention
-    depth: Literal["metric", "ordinal", "absent"]
+    depth: DepthOrAbsent
     step: int = 1
     forward_motion: bool = False
     notes: tuple[str, ...] = ()

@@ -13,6 +13,7 @@ from jaxtyping import Array
 from jaxtrapolate.bidirectional.assisted import DepthKind
 from jaxtrapolate.bidirectional.flows import complete_flows
 from jaxtrapolate.bidirectional.interpolate import interpolate_bidirectional
+from jaxtrapolate.bidirectional.options import VisibilityOptions
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.between import BETWEEN, CHAINED, PAIR, depth_of
 from jaxtrapolate.methods.method import Method, Stage, Values, rendered, upcoming
@@ -47,7 +48,8 @@ def _search(state, values: Values):
         depth=kind,
     )
     first, second = (replace(frame, color=compress(frame.color)) for frame in (flows.previous, flows.next))
-    made = interpolate_bidirectional(first, second, values["alpha"], depth=kind, visibility="round_trip").color
+    visible = VisibilityOptions(test="round_trip", depth=kind)
+    made = interpolate_bidirectional(first, second, values["alpha"], visibility=visible).color
     return {"image": jnp.where(made == first.color, jnp.asarray(previous.color), expand(made))}
 
 

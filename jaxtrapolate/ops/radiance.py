@@ -1,7 +1,7 @@
 """Radiance: demodulation by the material, logarithm, tone map, sRGB, each with its inverse."""
 
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +12,6 @@ from jaxtrapolate.precision import divide, widest
 from jaxtrapolate.records import GBuffer, check_gbuffer
 
 By = Literal["albedo+specular", "albedo", "none"]
-
-_BY = ("albedo+specular", "albedo", "none")
 
 
 @partial(jax.jit, static_argnames=("by",))
@@ -31,7 +29,7 @@ def demodulation_divisor(
     Raises:
         ValueError: an unknown `by`, no albedo, or with "none" no buffer at all.
     """
-    check_choice("by", by, _BY)
+    check_choice("by", by, get_args(By))
     size = check_gbuffer("gbuffer", gbuffer)
     if by == "none":
         if size is None:

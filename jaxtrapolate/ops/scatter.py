@@ -5,7 +5,7 @@ Convention:
 """
 
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,6 @@ from jaxtrapolate.precision import divide, widest
 
 Mode = Literal["sum", "average", "linear", "softmax"]
 
-_MODES = ("sum", "average", "linear", "softmax")
 _NONE = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
@@ -205,7 +204,7 @@ def splat(
     """
     size = check_image("values", values)
     check_image("motion", motion, size=size, channels=2)
-    check_choice("mode", mode, _MODES)
+    check_choice("mode", mode, get_args(Mode))
     if mode in ("linear", "softmax"):
         weights = check_present("weights", weights, needed_by=f"mode={mode!r}")
         check_image("weights", weights, size=size, channels=1)

@@ -8,7 +8,7 @@ Convention:
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,7 @@ from jaxtrapolate.precision import widest
 
 Filter = Literal["nearest", "bilinear", "bicubic"]
 
-_FILTERS = ("nearest", "bilinear", "bicubic")
-_OUTSIDE = ("edge", "zero")
+Outside = Literal["edge", "zero"]
 
 
 def pixel_grid(height: int, width: int, dtype=jnp.float32) -> tuple[Float[Array, "1 w"], Float[Array, "h 1"]]:
@@ -232,7 +231,7 @@ def backward_warp(
     motion: Float[ArrayLike, "i j 2"],
     *,
     filter: Filter = "bilinear",
-    outside: Literal["edge", "zero"] | int | float | Float[ArrayLike, ""] = "edge",
+    outside: Outside | int | float | Float[ArrayLike, ""] = "edge",
 ) -> Float[Array, "i j c"]:
     """The image fetched along the motion: result[p] = image(p + motion[p]).
 
@@ -273,9 +272,9 @@ def backward_warp(
     """
     check_image("image", image)
     check_image("motion", motion, channels=2)
-    check_choice("filter", filter, _FILTERS)
+    check_choice("filter", filter, get_args(Filter))
     if isinstance(outside, str):
-        check_choice("outside", outside, _OUTSIDE)
+        check_choice("outside", outside, get_args(Outside))
     fill = not (isinstance(outside, str) and outside == "edge")
     value = jnp.asarray(0.0 if isinstance(outside, str) else outside)
     return _backward_warp(image, motion, value, filter=filter, fill=fill)

@@ -9,7 +9,7 @@ Non-finite values:
 """
 
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,6 @@ from jaxtrapolate.checks import check_array, check_choice, check_image
 from jaxtrapolate.precision import divide, widest
 
 Shade = Literal["release", "paper"]
-
-_SHADES = ("release", "paper")
 
 
 def _difference(prediction, target):
@@ -150,7 +148,7 @@ def shading_loss(
     References:
         Guo et al. 2021 (ExtraNet), eq. 6.
     """
-    check_choice("shade", shade, _SHADES)
+    check_choice("shade", shade, get_args(Shade))
     difference, finite = _difference(prediction, target)
     error = _absolute(difference)
     if shade == "paper":
