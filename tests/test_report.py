@@ -294,7 +294,7 @@ def test_infinite_decibels(tmp_path, infinite):
 
 
 def test_equal_images_without_decibels_have_infinitely_many():
-    equal, unknown = values.read_methods(
+    equal, unknown = values.named_methods(
         {"methods": {"a": {"psnr": None, "ssim": 1.0}, "b": {"psnr": None, "ssim": 0.9}}}
     )
     assert equal.psnr == math.inf
@@ -346,12 +346,12 @@ def test_pareto_front():
 
 
 def test_many_methods_are_told_apart():
-    methods = values.read_methods({"methods": {f"m{i}": {} for i in range(40)}})
+    methods = values.named_methods({"methods": {f"m{i}": {} for i in range(40)}})
     assert len({(m.color, m.marker) for m in methods}) == 40
 
 
 def test_best_and_reference():
-    methods = values.read_methods({"methods": {"warp": entry(30.0, 5), "b": entry(30.0, 2), "repeat": entry(9.0, 1)}})
+    methods = values.named_methods({"methods": {"warp": entry(30.0, 5), "b": entry(30.0, 2), "repeat": entry(9.0, 1)}})
     assert values.best_method(methods).name == "b"
     assert values.reference_method(methods).name == "warp"
     assert values.headline(methods[:1]) == "warp: 30.0 dB at 5.00 ms"
