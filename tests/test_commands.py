@@ -8,6 +8,7 @@ import pytest
 from synthetic import make_frame, make_keyframe
 
 import jaxtrapolate as jx
+from jaxtrapolate.results import Results
 from jaxtrapolate.commands.inputs import terminal
 from jaxtrapolate.commands.main import main
 from jaxtrapolate.commands.tables import print_table
@@ -349,7 +350,7 @@ def test_brackets_are_printed(capsys):
         "skipped": {"dis": 'pip install "jaxtrapolate[flow]"'},
         "notes": ["[a]"],
     }
-    print_table(results, terminal())
+    print_table(Results.from_json(results), terminal())
     out = capsys.readouterr().out
     for text in ("clip[final]", '"jaxtrapolate[flow]"', "note: [a]"):
         assert text in out

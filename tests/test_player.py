@@ -257,5 +257,5 @@ def test_a_frame_that_lacks_buffers_is_named():
         def frame(self, number):
             return jx.replace(super().frame(number), motion=None if number == 5 else super().frame(number).motion)
 
-    with pytest.raises(jx.InputError, match="frame 5: method 'warp', stage 'reproject': missing target.motion"):
+    with pytest.raises(jx.InputError, match=r"frame 5: method 'warp', stage 'reproject': missing target\.motion"):
         jx.evaluate(Damaged(range(8)), ["warp"])

@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 from jaxtrapolate import report
+from jaxtrapolate import results as results_module
 from jaxtrapolate.errors import InputError
 from jaxtrapolate.files import write_png
 from jaxtrapolate.ops.causes import CAUSES
@@ -363,7 +364,7 @@ def test_best_and_reference():
     [(1, 1.0), ("2.5", 2.5), ("inf", math.inf), ("-Infinity", -math.inf), (math.nan, None), (True, None), ([], None)],
 )
 def test_number(value, expected):
-    assert values.number(value) == expected
+    assert results_module.number(value) == expected
 
 
 def test_texts():

@@ -38,7 +38,7 @@ def _silent(text: str, done: float | int, total: float | int) -> None:
 
 def evaluate(
     sequence: Sequence | str | os.PathLike[str],
-    methods: Iterable[str] | Mapping[str, Method] | None = None,
+    methods: Iterable[str] | Mapping[str, Method] | None,
     *,
     factor: int = 2,
     metrics: Iterable[str] = DEFAULT_METRICS,
@@ -49,8 +49,8 @@ def evaluate(
 
     Args:
         sequence: the frames, or the path of a folder that `open_sequence` reads.
-        methods: names, as `jaxtrapolate.load` takes them, or methods by the names that they have in the results; all
-            that can run by default.
+        methods: names, as `jaxtrapolate.load` takes them, or methods by the names that they have in the results;
+            `None` for all that can run.
         factor: of every `factor` frames the first counts as rendered, the others are held back, so that several
             frames in a row are generated, each from rendered ones.
         metrics: names, as `jaxtrapolate.metrics.load` takes them; PSNR is always scored.
@@ -245,7 +245,7 @@ class Evaluation:
                 step(f"{metric.name} of {name}", len(self.numbers), len(self.numbers))
                 try:
                     clips.setdefault(name, {})[metric.name] = metric(
-                        self._clip(name, scores[name], gallery), self._true_clip(gallery)
+                        self._clip(name, scores[name], gallery), self._true_clip(gallery, self.methods[name].scale)
                     )
                 except (ValueError, RuntimeError) as error:
                     notes[metric.name] = f"{metric.name}: {error}"
@@ -258,9 +258,10 @@ class Evaluation:
                 raise ValueError(f"frame {found.number} of {name} is not finite")
             yield gallery.codes(name, found.number)
 
-    def _true_clip(self, gallery: Gallery) -> Iterator[Any]:
+    def _true_clip(self, gallery: Gallery, scale: int) -> Iterator[Any]:
         for _, window in load(self.sequence, self._scored):
-            yield eight_bit(gallery.display(window.truth.color))
+            truth = window.truth if scale == 1 or window.larger is None else window.larger
+            yield eight_bit(gallery.display(truth.color))
 
     def _results(
         self,
@@ -311,6 +312,10 @@ class Evaluation:
         nonfinite = {n: c for n in self.numbers if (c := sequence.nonfinite(n))}
         if nonfinite:
             notes.append(f"{sum(nonfinite.values())} non-finite pixels in {len(nonfinite)} scored frames: not scored")
+        scales = sorted({method.scale for method in self.methods.values()})
+        if scales != [1]:
+            text = " and ".join(f"{scale * sequence.size[1]}x{scale * sequence.size[0]}" for scale in scales)
+            notes.append(f"each method is scored at the size of its own output: {text}")
         if sequence.depth == "ordinal":
             notes.append("depth is only ordered, not a distance: holes are found by the hole masks")
         return notes
@@ -320,14 +325,18 @@ def score_window(
     sequence: Sequence, slot: Slot, window: Window, generated: Mapping[str, Generated], metrics: list[Metric]
 ) -> dict[str, FrameScore]:
     """The scores of what methods generated for a held-back frame."""
-    if not generated:
-        return {}
-    causes, invalid = causes_of(sequence, window), sequence.invalid(slot.number)
-    options: dict[str, Any] = {"hdr": sequence.hdr, "metrics": metrics, "distance": slot.distance}
-    return {
-        name: score(result.image, window, causes, invalid, ms=result.ms, **options)
-        for name, result in generated.items()
-    }
+    found: dict[str, FrameScore] = {}
+    known: dict[int, tuple[np.ndarray | None, np.ndarray | None]] = {}
+    for name, result in generated.items():
+        scale = result.image.shape[0] // sequence.size[0]
+        if scale not in known:
+            invalid = sequence.invalid(slot.number)
+            if invalid is not None:
+                invalid = invalid.repeat(scale, 0).repeat(scale, 1)
+            known[scale] = causes_of(sequence, window, larger=scale > 1), invalid
+        options: dict[str, Any] = {"hdr": sequence.hdr, "metrics": metrics, "distance": slot.distance}
+        found[name] = score(result.image, window, *known[scale], ms=result.ms, **options)
+    return found
 
 
 def _reasons(scores: Mapping[str, list[FrameScore]]) -> list[str]:

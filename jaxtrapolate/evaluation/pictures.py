@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.evaluation.score import causes_of, display
+from jaxtrapolate.evaluation.score import causes_of, display, truth_for
 from jaxtrapolate.evaluation.windows import Window
 from jaxtrapolate.files import Sequence, read_png, write_png
 from jaxtrapolate.methods.method import rendered
@@ -91,7 +91,7 @@ class Gallery:
 
     def put(self, method: str, window: Window, image: Any) -> None:
         """Keeps a generated frame and its error."""
-        truth = np.asarray(self.display(window.truth.color))
+        truth = np.asarray(self.display(truth_for(window, image).color))
         shown = np.asarray(self.display(image))
         self._put(window.number, file_name(method), eight_bit(shown))
         self._put(window.number, f"{file_name(method)}_error", colorize_error(np.abs(shown - truth).mean(-1)))

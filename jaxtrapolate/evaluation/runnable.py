@@ -19,6 +19,9 @@ def runnable(
     """
     usable, skipped, left_out = {}, dict(unavailable), {}
     for name, method in methods.items():
+        if method.scale not in (1, sequence.scale):
+            skipped[name] = f"generates frames {method.scale} times as large, which the input does not have as truth"
+            continue
         slots = held_back_slots(sequence, past=method.past, future=method.future, factor=factor)
         chosen = next((slot for slot in slots if slot.full and not slot.rendered), None)
         if chosen is None:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Mapping
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -17,7 +18,7 @@ from jaxtrapolate.ops.causes import CAUSES, cause_map, disoccluded
 from jaxtrapolate.ops.depth import surfaces_of
 from jaxtrapolate.ops.motion import chain_motion
 from jaxtrapolate.ops.radiance import srgb_encode, tonemap
-from jaxtrapolate.records import replace
+from jaxtrapolate.records import Frame, replace
 from jaxtrapolate.results import CauseScore, FrameScore, MethodResult, RunTime
 
 DEFAULT_METRICS = ("psnr", "ssim")
@@ -29,23 +30,43 @@ def display(color: Float[ArrayLike, "h w 3"], *, hdr: bool) -> Float[Array, "h w
     return tonemap(color) if hdr else srgb_encode(jnp.clip(color, 0, 1))
 
 
-def causes_of(sequence: Sequence, window: Window) -> np.ndarray | None:
+def truth_for(window: Window, image: Float[ArrayLike, "h w 3"]) -> Frame:
+    """The true frame of the size of an image.
+
+    Raises:
+        ValueError: there is none.
+    """
+    sizes = []
+    for truth in (window.truth, window.larger):
+        if truth is not None and truth.color is not None:
+            if truth.color.shape[:2] == image.shape[:2]:
+                return truth
+            sizes.append(f"{truth.color.shape[1]}x{truth.color.shape[0]}")
+    raise ValueError(f"image: expected a size of {' or '.join(sizes)}, got {image.shape[1]}x{image.shape[0]}")
+
+
+def causes_of(sequence: Sequence, window: Window, *, larger: bool = False) -> np.ndarray | None:
     """The `cause_map` of a window: exact holes where the sequence knows its 3D flow, else by the hole masks.
 
     The source is the newest rendered frame; the exact holes are those between neighbours of the numbering, so several
-    held-back frames in a row have their causes by the masks. `None` without motion vectors.
+    held-back frames in a row have their causes by the masks, and so has the size of the output where `larger` is set.
+    `None` without motion vectors.
     """
-    motion = window.target.motion
+    newest = rendered(window.history)[0]
+    between, source_frame = window.history[newest + 1 :], window.history[newest]
+    truth, motion = window.truth, window.target.motion
+    if larger:
+        if sequence.larger is None or window.larger is None:
+            raise ValueError("larger: expected a sequence that has larger frames")
+        run = around(sequence, window.number, before=len(window.history) - newest)
+        source_frame, *between = (jax.device_put(sequence.larger.frame(n)) for n in run[:-1])
+        truth, motion = window.larger, window.larger.motion
+    for frame in reversed(between):
+        motion = None if motion is None or frame.motion is None else chain_motion(motion, frame.motion)
     if motion is None:
         return None
-    truth, newest = window.truth, rendered(window.history)[0]
-    source_frame = window.history[newest]
-    for frame in window.history[:newest:-1]:
-        if frame.motion is None:
-            return None
-        motion = chain_motion(motion, frame.motion)
     hidden, metric = None, sequence.depth == "metric"
-    if metric and newest == len(window.history) - 1:
+    if metric and not between and not larger:
         previous, number = around(sequence, window.number, before=1)
         target, source = sequence.keyframe(number), sequence.keyframe(previous)
         if target is not None and source is not None:
@@ -71,7 +92,7 @@ def score(
     Pixels that were not finite in the input are left out. A metric that cannot be had (a frame smaller than its window)
     is None, and `unscored` says why. Metrics of clips are not for here.
     """
-    color = check_present("truth.color", window.truth.color, needed_by="score")
+    color = check_present("truth.color", truth_for(window, image).color, needed_by="score")
     spaces = {"display": (display(image, hdr=hdr), display(color, hdr=hdr)), "linear": (image, color)}
     generated, truth = spaces["display"]
     valid = np.ones((*generated.shape[:2], 1), bool) if invalid is None else ~invalid[..., None]

@@ -44,6 +44,11 @@ def write_evaluation_video(
             truth = eight_bit(gallery.display(window.truth.color))
             yield [truth, *(gallery.codes(name, slot.number) for name in labels)]
 
+    def alike(row: list[np.ndarray]) -> list[np.ndarray]:
+        """All of the largest one's size, by repeated pixels."""
+        height = max(picture.shape[0] for picture in row)
+        return [p.repeat(height // p.shape[0], 0).repeat(height // p.shape[0], 1) for p in row]
+
     starts = {slot.before[-slot.distance] for slot in slots}
-    frames: Iterator[Image.Image] = (side_by_side(row, ["truth", *labels.values()]) for row in shown())
+    frames: Iterator[Image.Image] = (side_by_side(alike(row), ["truth", *labels.values()]) for row in shown())
     write_video(path, frames, count=len(slots) + len(starts), fps=fps)

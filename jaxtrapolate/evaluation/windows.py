@@ -29,7 +29,8 @@ def hide(frame: Frame) -> Frame:
 class Window:
     """A frame to be generated and what surrounds it: history, target and future as methods see them.
 
-    The truth is the frame itself, with all that is known of it; empty where nothing was drawn for it.
+    The truth is the frame itself, with all that is known of it; empty where nothing was drawn for it. `larger` is the
+    same frame at the output's size, for methods that super sample, where the sequence has it.
     """
 
     number: int
@@ -37,6 +38,7 @@ class Window:
     history: Frames
     target: Frame
     future: Frames
+    larger: Frame | None = None
 
 
 def held_back(sequence: Sequence, *, past: int, future: int = 0, factor: int = 2) -> list[int]:
@@ -87,7 +89,10 @@ def load(sequence: Sequence, slots: Iterable[Slot], *, hidden: Collection[int] =
     for number, frame in prefetch(sequence, sorted({n for s in slots for n in s.numbers})):
         cached[number] = jax.device_put(frame)
         while slot is not None and number == slot.numbers[-1]:
-            yield slot, _window(slot, cached, hidden, sequence.step)
+            window = _window(slot, cached, hidden, sequence.step)
+            if sequence.larger is not None and slot.virtual is None:
+                window = replace(window, larger=jax.device_put(sequence.larger.frame(slot.number)))
+            yield slot, window
             slot = next(waiting, None)
         if slot is not None:
             cached = {n: f for n, f in cached.items() if n >= slot.numbers[0]}
