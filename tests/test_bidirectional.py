@@ -132,7 +132,11 @@ def test_against_the_loop(filter, starts):
 # Exactness
 
 
-@pytest.mark.parametrize("size", [(5, 7), (1, 6), (6, 1), (1, 1)], ids=str)
+@pytest.mark.parametrize(
+    "size",
+    [(5, 7), pytest.param((1, 6), marks=pytest.mark.slow), pytest.param((6, 1), marks=pytest.mark.slow), (1, 1)],
+    ids=str,
+)
 def test_no_motion_blends(size):
     previous, next = pair(size=size)
     color, case, weight = numbers(jx.interpolate_bidirectional(previous, next, 0.25))
@@ -196,7 +200,12 @@ def test_at_the_ends_the_frames_are_returned_bit_for_bit(alpha):
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"choice": "error"}, {"flow_filter": "bilinear"}, {"visibility": "round_trip"}]
+    "options",
+    [
+        {},
+        *(pytest.param(o, marks=pytest.mark.slow) for o in ({"choice": "error"}, {"flow_filter": "bilinear"})),
+        {"visibility": "round_trip"},
+    ],
 )
 def test_better_than_blending(options):
     previous, next = moving()

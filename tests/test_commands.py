@@ -68,7 +68,10 @@ def test_check_reports_buffers_convention_and_methods(capsys, dump):
         assert word in out
 
 
-@pytest.mark.parametrize("convention", ["previous_minus_current,pixels,up", "current_minus_previous,pixels,down"])
+@pytest.mark.parametrize(
+    "convention",
+    ["previous_minus_current,pixels,up", pytest.param("current_minus_previous,pixels,down", marks=pytest.mark.slow)],
+)
 def test_check_finds_the_convention(capsys, dump, convention):
     """The reader is told a wrong one; check names the right one."""
     code, out, _ = run(capsys, "check", dump, "--motion", convention)

@@ -445,7 +445,7 @@ def root_of(dump):
     return dict(re.findall(r'([\w-]+)="([^"]*)"', re.search(r"<html([^>]*)>", dump)[1]))
 
 
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("width", [1280, pytest.param(390, marks=pytest.mark.slow)])
 def test_browser_runs_the_script_and_moves_the_slider(tmp_path, browse, width):
     path = report.write_report(complete(tmp_path), tmp_path)
     root = root_of(browse(path, "dump-dom", f"window-size={width},1200", fragment="#selftest"))
