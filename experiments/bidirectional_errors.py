@@ -34,6 +34,7 @@ import jaxtrapolate as jx
 from jaxtrapolate.atomic import atomic_path
 from jaxtrapolate.bidirectional.assisted import shown
 from jaxtrapolate.bidirectional.search import positions, within
+from jaxtrapolate.precision import divide
 from jaxtrapolate.runtime.timing import machine
 from jaxtrapolate.scenes import Scene, flow, render, scene, visible
 
@@ -100,7 +101,7 @@ def total_counts(made: jx.Interpolation, exact: tuple, seen: tuple) -> jax.Array
     sums = jnp.zeros((len(KINDS), len(BELOW) + 1))
     for k, (found, weight) in enumerate(((made.forward, 1 - w), (made.backward, w))):
         truth = positions(*w.shape) + exact[k][..., :2]
-        read = made.color[..., 2 * k : 2 * k + 2] / jnp.where(weight > 0, weight, 1)[..., None]
+        read = divide(made.color[..., 2 * k : 2 * k + 2], weight[..., None])
         by_search, by_color = distance(found.position, truth), distance(read, truth)
         used = weight > 0
         visible_there, shown_there = seen[k]

@@ -20,8 +20,8 @@ from jaxtrapolate.ops.depth import apart as depth_apart
 from jaxtrapolate.ops.depth import changed, held, surfaces_of
 from jaxtrapolate.ops.motion import camera_motion
 from jaxtrapolate.ops.scatter import splat_source
-from jaxtrapolate.ops.warp import sample, take_rows
-from jaxtrapolate.precision import widest
+from jaxtrapolate.ops.warp import root, sample, take_rows
+from jaxtrapolate.precision import divide, widest
 from jaxtrapolate.records import Camera, Keyframe, replace
 
 _HIDDEN = 0.2  # relative: a surface whose depth changes by more is taken for another one
@@ -34,10 +34,8 @@ def _view_depth(camera: Camera, points: Array) -> Array:
     """
     view, projection = cast(Array, camera.view), cast(Array, camera.projection)
     seen = points @ view.T
-    square = jnp.sum(jnp.square(projection[3, :3]))
-    perspective = square > 0
     along = (seen[..., :3] @ projection[3, :3])[..., None]
-    return jnp.where(perspective, along / jnp.sqrt(jnp.where(perspective, square, 1)), -seen[..., 2:3])
+    return divide(along, root(jnp.sum(jnp.square(projection[3, :3]))), otherwise=-seen[..., 2:3])
 
 
 @jax.jit

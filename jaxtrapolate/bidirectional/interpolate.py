@@ -49,7 +49,7 @@ from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image, chec
 from jaxtrapolate.ops.depth import held, released, surface_depth
 from jaxtrapolate.ops.strips import by_strips, once
 from jaxtrapolate.ops.warp import Filter, all_finite, inside, sample
-from jaxtrapolate.precision import widest
+from jaxtrapolate.precision import divide, widest
 from jaxtrapolate.records import Keyframe, replace
 
 Start = Literal["default", "dual", "latest"]
@@ -193,11 +193,6 @@ def _visible_in(other: _Side, found: _Found, epsilon_depth, epsilon_trip, option
     return there, seen
 
 
-def _ratio(now, then):
-    """now / then, 0 where then is 0: the offsets of that frame are 0 as well."""
-    return jnp.where(then > 0, now / jnp.where(then > 0, then, 1), 0)
-
-
 def _part(sources, top, rows: int, *, options: _Options) -> tuple[Interpolation, tuple[Array | None, ...]]:
     """Some rows of the frame, before shading and without its offsets; and those but for alpha."""
     previous, next, epsilon_error, epsilon_depth, epsilon_trip = sources
@@ -250,8 +245,8 @@ def _interpolate(previous, next, alpha, offsets, epsilon_error, epsilon_depth, e
 
     def side(frame, flow, fraction, offset, last_depth, last):
         flow, known = flow.astype(wide), None
-        if offset is not None:
-            known = LatestOffsets(offset.astype(wide), last_depth, _ratio(fraction, last))
+        if offset is not None:  # where the last fraction is 0, so are its offsets
+            known = LatestOffsets(offset.astype(wide), last_depth, divide(fraction, last))
         depth, passed = None, None
         if options.depth != "absent":
             depth = held(surface_depth(jnp.asarray(frame.depth)))

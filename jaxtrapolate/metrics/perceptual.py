@@ -26,7 +26,8 @@ from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_inst
 from jaxtrapolate.metrics.imagenet import LPIPS_LAYERS, Net, NetworkWeights, features
 from jaxtrapolate.metrics.imagenet import network_weights as network_weights
 from jaxtrapolate.metrics.imagenet import vgg_features as vgg_features
-from jaxtrapolate.precision import widest
+from jaxtrapolate.ops.warp import root
+from jaxtrapolate.precision import divide, widest
 
 VmafModel = Literal["vmaf_v0.6.1", "vmaf_v0.6.1neg", "vmaf_4k_v0.6.1"]
 
@@ -117,8 +118,7 @@ _SMALLEST = {"vgg": 16, "alex": 31}  # pixels that leave one in the last layer
 
 def _normalized(features):
     square = jnp.sum(jnp.square(features), -1, keepdims=True)
-    lit = square > 0  # the square root has no gradient at 0
-    return jnp.where(lit, features / (jnp.sqrt(jnp.where(lit, square, 1)) + 1e-10), 0)
+    return divide(features, root(square) + 1e-10, where=square > 0)
 
 
 @partial(jax.jit, static_argnames=("net",))

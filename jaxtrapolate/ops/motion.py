@@ -16,6 +16,7 @@ from jaxtrapolate.checks import check_array, check_choice, check_image
 from jaxtrapolate.ops.depth import surface_depth
 from jaxtrapolate.ops.scatter import splat_nearest
 from jaxtrapolate.ops.warp import backward_warp, landing, take_rows
+from jaxtrapolate.precision import divide
 from jaxtrapolate.records import Camera, Sign, Units, YAxis, check_camera
 
 _SIGNS = ("previous_minus_current", "current_minus_previous")
@@ -87,11 +88,10 @@ def _project(camera: Camera, points: Array, height: int, width: int) -> tuple[Ar
     view, projection = cast(Array, camera.view), cast(Array, camera.projection)  # `check_camera` has refused None
     clip = points @ (projection @ view).T
     w = clip[..., 3:]
-    ahead = w > 0
-    ndc = clip[..., :2] / jnp.where(ahead, w, 1)
+    ndc = divide(clip[..., :2], w)
     half, size = jnp.array([0.5, -0.5], ndc.dtype), jnp.array([width, height], ndc.dtype)
     half, size = (jnp.broadcast_to(a, ndc.shape) for a in (half, size))
-    return (ndc * half + 0.5) * size - 0.5, ahead
+    return (ndc * half + 0.5) * size - 0.5, w > 0
 
 
 @jax.jit

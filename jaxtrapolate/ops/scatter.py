@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_present
 from jaxtrapolate.ops.depth import surface_depth
 from jaxtrapolate.ops.warp import landing, take_rows, weigh
-from jaxtrapolate.precision import widest
+from jaxtrapolate.precision import divide, widest
 
 Mode = Literal["sum", "average", "linear", "softmax"]
 
@@ -160,7 +160,7 @@ def _splat(values, motion, weights, *, mode):
     if not normalised:
         return total
     summed, weight = total[..., :-1], total[..., -1:]
-    return jnp.where(weight > 0, summed / jnp.where(weight > 0, weight, 1), 0)
+    return divide(summed, weight)
 
 
 def splat(

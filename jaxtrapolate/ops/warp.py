@@ -145,18 +145,24 @@ def _nearest(product, image, x, y):
     return take_rows(image.reshape(-1, channels), row * width + column)
 
 
-def _bilinear(product, image, x, y):
+def bilinear_taps(image: Inexact[Array, "h w c"], x: Array, y: Array) -> list[tuple[Array, Array]]:
+    """The four pixels around each position `[..., C]` and their weights `[..., 1]`, row by row."""
     height, width, _ = image.shape
     column, t = cell(x, width)
     row, u = cell(y, height)
     t, u = t[..., None], u[..., None]
-    real = widest(image, x)
-    wide = jnp.result_type(image.dtype) if jnp.iscomplexobj(image) else real
     right, down = int(width > 1), int(height > 1)
     taps = take_offsets(image, row, column, [(0, 0), (0, right), (down, 0), (down, right)])
     # a (1 - t) + b t returns a tap bit for bit at t = 0 and t = 1; a + t (b - a) does not
     weights = [(1 - t) * (1 - u), t * (1 - u), (1 - t) * u, t * u]
-    a, b, c, d = (product(tap.astype(wide), weight.astype(real)) for tap, weight in zip(taps, weights, strict=False))
+    return list(zip(taps, weights, strict=True))
+
+
+def _bilinear(product, image, x, y):
+    real = widest(image, x)
+    wide = jnp.result_type(image.dtype) if jnp.iscomplexobj(image) else real
+    taps = bilinear_taps(image, x, y)
+    a, b, c, d = (product(tap.astype(wide), weight.astype(real)) for tap, weight in taps)
     return (a + b) + (c + d)
 
 
