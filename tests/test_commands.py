@@ -8,12 +8,12 @@ import pytest
 from synthetic import make_frame, make_keyframe
 
 import jaxtrapolate as jx
-from jaxtrapolate.results import Results
 from jaxtrapolate.commands.inputs import terminal
 from jaxtrapolate.commands.main import main
 from jaxtrapolate.commands.tables import print_table
 from jaxtrapolate.files import read_exr, read_png, write_png, write_unreal_frame
 from jaxtrapolate.files.packed import encode_motion
+from jaxtrapolate.results import Results
 
 SIZE = (32, 48)
 

@@ -1,4 +1,4 @@
-"""The README, the pages and the site: links that lead somewhere, examples that run, names and figures that are right."""
+"""The README, the pages and the site: links lead somewhere, examples run, names and figures are right."""
 
 import ast
 import doctest

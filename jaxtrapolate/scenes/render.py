@@ -361,8 +361,8 @@ def _render(
 def _object_motion(scene: Scene, poses: tuple[Pose, Pose]) -> Array | None:
     """The map of the world now to that of the previous frame, `[N, 4, 4]`, for the ids 1 to N of the stencil.
 
-    An object of several bodies has that of the first of them, the one that the others hang on. `None` in a scene without
-    bodies.
+    An object of several bodies has that of the first of them, the one that the others hang on. `None` where a scene has
+    no bodies.
     """
     if len(scene.bodies.parents) == 1:
         return None
