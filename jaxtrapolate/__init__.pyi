@@ -25,6 +25,9 @@ from .bidirectional.search import Correspondence as Correspondence
 from .bidirectional.search import iterative_search as iterative_search
 from .bidirectional.starts import dual_start as dual_start
 from .bidirectional.starts import latest_start as latest_start
+from .errors import InputError as InputError
+from .evaluation.evaluate import evaluate as evaluate
+from .files import open_sequence as open_sequence
 from .methods import Method as Method
 from .methods import Stage as Stage
 from .methods import load as load
@@ -61,4 +64,5 @@ from .records import Frame as Frame
 from .records import GBuffer as GBuffer
 from .records import Keyframe as Keyframe
 from .records import replace as replace
+from .results import Results as Results
 from .runtime.memory import keep_memory as keep_memory

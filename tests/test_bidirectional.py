@@ -131,7 +131,11 @@ def test_against_the_loop(filter, starts):
 # Exactness
 
 
-@pytest.mark.parametrize("size", [(5, 7), (1, 6), (6, 1), (1, 1)], ids=str)
+@pytest.mark.parametrize(
+    "size",
+    [(5, 7), pytest.param((1, 6), marks=pytest.mark.slow), pytest.param((6, 1), marks=pytest.mark.slow), (1, 1)],
+    ids=str,
+)
 def test_no_motion_blends(size):
     previous, next = pair(size=size)
     color, case, weight = numbers(jx.interpolate_bidirectional(previous, next, 0.25))
@@ -198,8 +202,8 @@ def test_at_the_ends_the_frames_are_returned_bit_for_bit(alpha):
     "options",
     [
         {},
-        {"search": jx.SearchOptions(choice="error")},
-        {"search": jx.SearchOptions(filter="bilinear")},
+        pytest.param({"search": jx.SearchOptions(choice="error")}, marks=pytest.mark.slow),
+        pytest.param({"search": jx.SearchOptions(filter="bilinear")}, marks=pytest.mark.slow),
         {"visibility": jx.VisibilityOptions(test="round_trip")},
     ],
     ids=["default", "error", "bilinear", "round trip"],

@@ -58,7 +58,7 @@ def test_default_weights_are_ahead_of_their_inputs(name):
         causes = causes_of(sequence, window)
         for m, method in methods.items():
             image = method(*arguments(method, window))
-            decibels[m].append(score(image, window, causes, None, hdr=True)["psnr"])
+            decibels[m].append(score(image, window, causes, None, hdr=True).psnr)
     mean = {m: np.mean(values) for m, values in decibels.items()}
     assert mean["extranet"] > mean["occlusion_warp"] + 1
     assert mean["extranet"] > mean["guided_warp"]

@@ -178,6 +178,13 @@ def check_count(option: str, value: int) -> int:
     return value
 
 
+def check_factor(value: int) -> int:
+    """A factor of frame rates, 2 to 1000."""
+    if not 2 <= value <= 1000:
+        raise InputError(f"--factor: expected 2 to 1000, got {value}")
+    return value
+
+
 def parse_size(text: str) -> tuple[int, int]:
     """(H, W) from "WxH"."""
     match = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)

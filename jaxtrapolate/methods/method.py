@@ -2,8 +2,9 @@
 
 The run, the benchmark, the plan and the reports all read that one list. A stage is a pure function of the method's
 state (its weights) and of the values so far, a dict; it returns the values that it adds. A method starts with "carry",
-"history", "target" and "future", frames whose depth is +inf where no surface was hit, and ends with "image". A stage on
-the host (a library that is not JAX) is run between the compiled ones around it.
+"history", "target" and "future", frames whose depth is +inf where no surface was hit, and ends with "image". A target
+with colour is a rendered frame: its stages start with that as "image". A stage with memory returns a new "carry". A
+stage on the host (a library that is not JAX) is run between the compiled ones around it.
 """
 
 import dataclasses
@@ -39,7 +40,8 @@ class Stage:
             that and the rendered one before it, and "before_next", in future before the next rendered frame.
         optional: whether the method does without it: left out where a buffer is missing. Without a stage that is not
             optional the method cannot run.
-        past: how many rendered frames it needs.
+        past: how many rendered frames it needs in history; 0 where its target or the carry is enough.
+        on: the targets that it runs on: those that are generated (without colour), the rendered ones, or both.
         host: whether its function is no JAX code: it gets arrays and is never traced.
         extra: the optional dependency that it needs, as in `pip install "jaxtrapolate[extra]"`.
     """
@@ -49,6 +51,7 @@ class Stage:
     reads: tuple[str, ...] = ()
     optional: bool = False
     past: int = 1
+    on: Literal["generated", "rendered", "both"] = "generated"
     host: bool = False
     extra: str | None = None
 
@@ -136,7 +139,8 @@ class Method:
 
     history and future are tuples of `Frame` in order of display, oldest first; a frame may lack colour (only its
     buffers were drawn): motion chains through it. target is the `Frame` to be made: its time, and whatever buffers were
-    drawn for it. A target that has colour was rendered, and is returned as it is by methods that do not super sample.
+    drawn for it. A target that has colour was rendered; a method has stages for those if it super samples or remembers,
+    and returns them as they are if it has none.
 
     No frame may be left out between those handed over: each one's motion leads to the one before it here, also from
     future[0] to the target (to history[-1] where the target has no motion), and from the target to history[-1]. Of a
@@ -153,7 +157,8 @@ class Method:
         scale: output size over input size.
         state: a pytree, the weights.
         networks: the networks on their own, by name: pure functions `(state, *inputs) -> output` of one frame.
-        start: `(history, target) -> carry`, for methods with memory.
+        start: `(history, target) -> carry`, for methods with memory: these are to be given every frame in order of
+            display, the rendered ones too.
     """
 
     name: str
@@ -166,18 +171,32 @@ class Method:
     networks: Mapping[str, Callable[..., Any]] = dataclasses.field(default_factory=dict)
     start: Callable[[Frames, Frame], Any] | None = None
 
+    def __post_init__(self):
+        if self.scale != 1 and not any(stage.on != "generated" for stage in self.stages):
+            raise ValueError(f"method {self.name!r}: expected stages that super sample rendered frames too, got none")
+
+    @property
+    def memory(self) -> bool:
+        """Whether it has a carry, so that it is to be given every frame in order of display, the rendered ones too."""
+        return self.start is not None
+
+    def _on(self, target: Frame) -> tuple[Stage, ...]:
+        """The stages for a target as it is, rendered or to be generated."""
+        kind = "generated" if target.color is None else "rendered"
+        return tuple(stage for stage in self.stages if stage.on in (kind, "both"))
+
     def missing(self, history: Frames, target: Frame, future: Frames = ()) -> dict[str, list[str]]:
-        """What each stage that cannot run lacks: `{stage: [buffers]}`; of all stages, optional or not."""
-        return {s.name: lacks for s in self.stages if (lacks := self._lacks(s, history, target, future))}
+        """What each stage that cannot run lacks: `{stage: [buffers]}`; of all for such a target, optional or not."""
+        return {s.name: lacks for s in self._on(target) if (lacks := self._lacks(s, history, target, future))}
 
     def active(self, history: Frames, target: Frame, future: Frames = ()) -> tuple[Stage, ...]:
-        """The stages that run on frames like these.
+        """The stages that run on frames like these; none where a rendered target is returned as it is.
 
         Raises:
             ValueError: a stage that the method cannot do without lacks something, named in the message.
         """
         stages = []
-        for stage in self.stages:
+        for stage in self._on(target):
             lacks = self._lacks(stage, history, target, future)
             if not lacks:
                 stages.append(stage)
@@ -219,11 +238,9 @@ class Method:
 
         Raises:
             TypeError: traced, in a method with a stage on the host: there is no such function of it.
-            ValueError: see `active`; frames whose sizes differ, or a history without colour.
+            ValueError: see `active`; frames whose sizes differ, or for a target without colour a history without.
         """
         self._check(history, target, future)
-        if target.color is not None and self.scale == 1:
-            return carry, jnp.asarray(target.color)
         values = self._advance(self.active(history, target, future), state, carry, history, target, future)
         return values["carry"], values["image"]
 
@@ -233,7 +250,6 @@ class Method:
         """The values that a stage gets: what the stages before it have made, as a pure function like `function`.
 
         Training runs a network's inputs through it, under vmap and jit: `values_before("network", ...)["inputs"]`.
-        The target's colour is not looked at.
 
         Raises:
             TypeError, ValueError: as `function`; no stage of that name, or one that these frames leave out.
@@ -248,7 +264,8 @@ class Method:
     def first_values(self, carry: Any, history: Frames, target: Frame, future: Frames = ()) -> dict[str, Any]:
         """What the first stage gets: the frames, whose depth is +inf where no surface was hit (`surface_depth`)."""
         history, future = (tuple(map(surfaces, frames)) for frames in (history, future))
-        return {"carry": carry, "history": history, "target": surfaces(target), "future": future}
+        values = {"carry": carry, "history": history, "target": surfaces(target), "future": future}
+        return values if target.color is None or self.scale != 1 else values | {"image": jnp.asarray(target.color)}
 
     def _advance(self, stages, state, carry, history, target, future) -> dict[str, Any]:
         values = self.first_values(carry, history, target, future)
@@ -264,8 +281,6 @@ class Method:
     def _by_turns(self, carry, history, target, future):
         """As `function`, each row of stages between those on the host compiled as one."""
         self._check(history, target, future)
-        if target.color is not None and self.scale == 1:
-            return carry, jnp.asarray(target.color)
         values: dict[str, Any] = self._first_values(carry, history, target, future)
         for host, group in groupby(self.active(history, target, future), key=lambda stage: stage.host):
             row = tuple(group)
@@ -289,7 +304,7 @@ class Method:
             for i, frame in enumerate(frames):
                 size = check_frame(f"{role}[{i}]", frame, size=size)
         check_frame("target", target, size=size)
-        if not rendered(history):
+        if target.color is None and not rendered(history):
             raise ValueError(f"history: expected a frame with colour, got {len(history)} frames without")
 
     @cached_property

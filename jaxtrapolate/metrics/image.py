@@ -40,7 +40,16 @@ def _squared_error(first, second, mask):
 
 
 def check_pair(first: Array, second: Array, mask: Array | None) -> None:
-    """Raise unless two images and a mask fit each other."""
+    """Raises where two images and a mask do not fit each other.
+
+    Args:
+        first: `[H, W, C]`.
+        second: of the same shape.
+        mask: `[H, W, 1]`, or `None`.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, or shapes that differ.
+    """
     size = check_image("first", first)
     check_image("second", second, size=size, channels=first.shape[-1])
     if mask is not None and tuple(mask.shape) != (*size, 1):
