@@ -137,7 +137,7 @@ def evaluate(
     with open_output(folder, "evaluate", settings, fresh=fresh) as output:
         output.agree(
             "weights",
-            {name: fingerprint(method.state) for name, method in methods.items() if jax.tree.leaves(method.state)},
+            {name: fingerprint(method.weights) for name, method in methods.items() if jax.tree.leaves(method.weights)},
         )
         requested = {
             "version": __version__,
