@@ -170,8 +170,8 @@ def motion_blur(
         samples: frames that are made on each side, at least 1; they are made one after the other, so that memory does
             not depend on it.
         targets: the geometry of the frames to be made, `target` of `interpolate_bidirectional`, each field
-            `[2 samples, ...]` in order of time: at k shutter / (2 samples + 1) intervals from `current`, k = -samples .. samples
-            without 0.
+            `[2 samples, ...]` in order of time: at k shutter / (2 samples + 1) intervals from `current`, k from -samples
+            to samples without 0.
         lights: as of `interpolate_run`, `[2 samples + 1, ...]` in order of time, with the rendered frame's.
         options: of `interpolate_bidirectional`, but target and offsets. `shade_attributes` is called for each frame,
             the rendered one too, and what it gives is averaged.

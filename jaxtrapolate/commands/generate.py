@@ -160,7 +160,7 @@ def run(options: argparse.Namespace) -> None:
     settings = {
         **sequence.identity(),
         "method": method.name,
-        "weights": fingerprint(method.state) if jax.tree.leaves(method.state) else None,
+        "weights": fingerprint(method.weights) if jax.tree.leaves(method.weights) else None,
         "factor": factor if any(slot.virtual for slot in targets) else None,
     }
     with open_output(options.output, "generate", settings, fresh=options.fresh) as output:

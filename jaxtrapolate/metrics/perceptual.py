@@ -146,8 +146,8 @@ def lpips(
     """Learned perceptual image patch similarity: the weighted squared distance of two images' deep features.
 
     Args:
-        image: `[H, W, 3]`, display values in 0..1 (scaled to the network's -1..1 within), at least 31 x 31 for "alex" and
-            16 x 16 for "vgg". Computed in at least float32, at the highest precision of products.
+        image: `[H, W, 3]`, display values in 0..1 (scaled to the network's -1..1 within), at least 31 x 31 for "alex"
+            and 16 x 16 for "vgg". Computed in at least float32, at the highest precision of products.
         reference: the ground truth, likewise.
         net: "alex" is the better and faster score, "vgg" the smoother loss.
         weights: of `network_weights(net)`, by default those. Under jit hand them over as an argument, or they become
