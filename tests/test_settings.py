@@ -424,9 +424,9 @@ def draw():
 def work(folder):
     """What is done in two processes: an evaluation of a dump, and three steps of training."""
     folder, found = Path(folder), {}
-    options, optimizer = ToyOptions(wobble=0.1), Optimizer(learning_rate=0.03, warmup=2, clip=1.0)
+    options, optimizer = ToyOptions(wobble=0.1), Optimizer(peak_learning_rate=0.03, warmup=2, clip=1.0)
     task = ToyTask(options)
-    config = Config(task="toy", options=options, steps=3, batch=4, pool=8, average=0.9, optimizer=optimizer)
+    config = Config(task="toy", options=options, steps=3, batch=4, pool=8, ema_decay=0.9, optimizer=optimizer)
     step, pool = make_step(task, config), task.pool(round_key(0, 0), range(8))
     state = step.create()
     for _ in range(3):

@@ -364,8 +364,8 @@ def test_a_network_trained_on_rendered_windows(tmp_path):
         log_every=100,
         checkpoint_every=400,
         validate_every=400,
-        average=0.98,
-        optimizer=Optimizer(learning_rate=3e-3, clip=1.0),
+        ema_decay=0.98,
+        optimizer=Optimizer(peak_learning_rate=3e-3, clip=1.0),
     )
     scores = train_and_evaluate(settings, tmp_path, task=RefineTask(options))
     losses = [entry["loss"] for entry in read_metrics(tmp_path) if entry["kind"] == "train"]

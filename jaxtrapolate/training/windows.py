@@ -1,4 +1,4 @@
-"""Examples: a frame to be made and what surrounds it, from the embedded scenes without end, or from dumps.
+"""Examples: a frame to be generated and what surrounds it, from the embedded scenes without end, or from dumps.
 
 An example is a `Window`, as evaluation hands it to methods: history of rendered frames with the buffers of the frames
 between them, the target without colour, the truth. A task runs its method's own stages on it, up to the network, once
@@ -41,12 +41,12 @@ MOVING = tuple(name for name in scene_names() if name != "still")
 _SHOWN = 4  # validation windows whose images are kept
 
 Prepare = Callable[[Window, PRNGKeyArray], Example]
-"""What a task makes of a window, once: pure and traced; for windows of several sizes cut to one."""
+"""What a task derives from a window, once: pure and traced; for windows of several sizes cut to one."""
 
 
 @dataclasses.dataclass(frozen=True)
 class WindowOptions:
-    """Which windows a pool is made of.
+    """Which windows a pool consists of.
 
     Attributes:
         size: `(H, W)` of frames of embedded scenes.
@@ -279,7 +279,7 @@ class Windows:
         return jax.tree.map(lambda *a: jnp.concatenate(a)[skipped : skipped + len(numbers)], *blocks)
 
     def _block(self, key: PRNGKeyArray, words: list[int], number: int, validation: bool) -> Example:
-        """The windows of one scene or dump that are made together."""
+        """The windows of one scene or dump that are prepared together."""
         options, count = self.options, self.options.together
         rng = np.random.default_rng([*words, number])
         flips = rng.random((2, count)) < np.array(options.flip)[:, None]
