@@ -18,9 +18,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxtrapolate.checks import Size, check_choice
 from jaxtrapolate.errors import InputError
-from jaxtrapolate.evaluation.windows import Window, hide
-from jaxtrapolate.evaluation.windows import windows as windows_of
-from jaxtrapolate.files import Sequence, open_sequence, runs
+from jaxtrapolate.evaluation.schedule import Slot
+from jaxtrapolate.evaluation.windows import Window, hide, load
+from jaxtrapolate.files import Sequence, around, open_sequence, runs
 from jaxtrapolate.records import Frame, GBuffer, replace
 from jaxtrapolate.scenes import TRAINING_SEEDS, Scene, render, scene, scene_names, stack_scenes
 from jaxtrapolate.training.augment import flip
@@ -303,10 +303,18 @@ class Windows:
         times, steps = (rng.uniform(*bounds, count).astype(np.float32) for bounds in (options.time, options.step))
         return name, self._render(worlds, times, steps)
 
+    def _around(self, sequence: Sequence, number: int) -> Window:
+        """The window of any frame: of its neighbours every second one counts as rendered, from the next one on."""
+        before, behind = 2 * self._past - 1, max(0, 2 * self._future - 1)
+        group = around(sequence, number, before=before, behind=behind)
+        slot = Slot(number, group[:before], group[before + 1 :], rendered=False, first=False, full=True, distance=1)
+        ((_, window),) = load(sequence, [slot], hidden=group[1::2])
+        return window
+
     def _read(self, rng: np.random.Generator, count: int, validation: bool) -> tuple[str, Window]:
         dumps = [(sequence, held if validation else seen) for sequence, seen, held in self._dumps]
         shares = np.array([len(numbers) for _, numbers in dumps])
         sequence, numbers = dumps[rng.choice(len(dumps), p=shares / shares.sum())]
         chosen = [numbers[i] for i in rng.integers(0, len(numbers), count)]
-        read = [next(windows_of(sequence, [n], past=self._past, future=self._future)) for n in chosen]
+        read = [self._around(sequence, number) for number in chosen]
         return sequence.name, jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *read)
