@@ -108,7 +108,7 @@ def psnr(
 
 
 def _blur(image):
-    """The Gaussian of an 11 x 11 window over the places where it fits, `[H - 10, W - 10, C]`."""
+    """The Gaussian of an 11 x 11 window at the positions where it fits, `[H - 10, W - 10, C]`."""
     offsets = np.arange(-_RADIUS, _RADIUS + 1)
     kernel = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
     kernel = kernel / kernel.sum()
