@@ -35,8 +35,8 @@ def scores(scene: str, size: tuple[int, int], frame: int) -> dict[str, dict]:
         method = load("guided_warp", rows=rows)
         row = score(method(*arguments(method, window)), window, causes, None, hdr=True, metrics=())
         found[str(rows)] = {
-            "whole": row["psnr"],
-            "hole": row["by_cause"].get("hole", {}).get("psnr"),
+            "whole": row.psnr,
+            "hole": row.by_cause["hole"].psnr if "hole" in row.by_cause else None,
         }
     return found
 

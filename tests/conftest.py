@@ -24,6 +24,16 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     atexit.register(shutil.rmtree, _compiled, ignore_errors=True)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": _compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3"}
 
+
+def pytest_configure(config):
+    """The fast tests alone let LLVM leave out what makes programs faster: most of their time is compilation.
+
+    With slow ones among them, programs are those that users get.
+    """
+    if config.option.markexpr == "not slow" and "XLA_FLAGS" not in os.environ:
+        os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=0"
+
+
 if CHECKED:
     jaxtyping.install_import_hook("jaxtrapolate", "conftest.check_annotations")
 

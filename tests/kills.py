@@ -155,6 +155,8 @@ def main(arguments: list[str] | None = None) -> list[dict]:
     parser.add_argument("--signal", choices=("KILL", "INT"))
     options = parser.parse_args(arguments)
     results = []
+    # what runs in the background of a shell ignores interrupts, and so would the commands
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryDirectory() as temporary:
         base = Path(temporary)
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(base / "cache"))
@@ -166,6 +168,7 @@ def main(arguments: list[str] | None = None) -> list[dict]:
                 if options.command in (None, command) and options.signal in (None, what.name[3:]):
                     results.append(trial(base, command, words, what, options.moments, options.seed))
                     print(json.dumps(results[-1]), flush=True)
+    signal.signal(signal.SIGINT, before)
     return results
 
 

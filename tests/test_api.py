@@ -162,7 +162,7 @@ def batch(arrays):
 
 
 @pytest.mark.parametrize(
-    "name", cases("backward_warp-bicubic", "guided_warp", "splat-linear", "splat-softmax", *BETWEEN)
+    "name", cases("backward_warp-bicubic", "guided_warp", "hole_masks", "splat-linear", "splat-softmax", *BETWEEN)
 )
 def test_eager_is_jit_is_vmap(name):
     function, *arrays = OPERATIONS[name]
@@ -189,7 +189,17 @@ def derivatives(function, *arrays):
     return forward, sum(jnp.vdot(a, g) for a, g in zip(along, found, strict=True)), found, curved
 
 
-HEAVY = ["backward_warp-bicubic", "guided_warp", "hole_masks", "ssim", "splat", "splat-linear", *BETWEEN]
+HEAVY = [
+    "backward_warp-bicubic",
+    "guided_warp",
+    "hole_masks",
+    "ssim",
+    "splat",
+    "splat-linear",
+    "splat-softmax",
+    *BETWEEN,
+]
+HEAVY += ["camera_flow", "chain_motion", "iterative_search"]
 
 
 @pytest.mark.parametrize("name", cases(*HEAVY))

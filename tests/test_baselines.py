@@ -69,7 +69,10 @@ def test_names_and_kinds(methods):
         )
 
 
-@pytest.mark.parametrize("name", BETWEEN)
+HEAVY = ("grid_warp", "softmax_splat")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in HEAVY[1:] else n for n in BETWEEN])
 def test_still_frames_are_returned(methods, name):
     frame = replace(make_frame(1, SIZE), motion=np.zeros((*SIZE, 2), np.float32))
     image = methods[name]((frame,), Frame(time=1.5), (replace(frame, time=2.0),))
@@ -85,7 +88,7 @@ def test_a_still_frame_is_returned(methods, name):
     assert np.array_equal(methods[name]((frame,), replace(hide(frame), time=2.0)), frame.color)
 
 
-@pytest.mark.parametrize("name", ["half_motion", "grid_warp", "softmax_splat"])
+@pytest.mark.parametrize("name", ["half_motion", pytest.param("grid_warp", marks=pytest.mark.slow), "softmax_splat"])
 def test_translation_is_exact_between(methods, name):
     history, target, future = given(name, sliding)
     truth = sliding(0.5).color
@@ -244,7 +247,7 @@ def plane(eye, depth=6.0):
 
 
 @pytest.mark.parametrize("name", ["warp_3d", "grid_extrapolate"])
-@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("moving", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_cameras_tell_the_motion_of_what_is_static(methods, name, moving):
     """The view turns back: motion carried on is wrong there, cameras are right. Without motion vectors they suffice."""
     width = 12 / SIZE[1]
@@ -265,7 +268,7 @@ def test_cameras_tell_the_motion_of_what_is_static(methods, name, moving):
 # All of them
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in HEAVY else n for n in NAMES])
 def test_compiled_whole_is_stage_by_stage(methods, name):
     frames = given(name)
     image = methods[name](*frames)
@@ -332,7 +335,7 @@ def test_frames_without_colour_in_the_future_are_chained_through(methods):
     np.testing.assert_allclose(image[inner], sliding(0.5).color[inner], atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["half_motion", "softmax_splat", "warp_3d"])
+@pytest.mark.parametrize("name", ["half_motion", pytest.param("softmax_splat", marks=pytest.mark.slow), "warp_3d"])
 def test_gradients_are_finite_and_there(methods, name):
     history, target, future = given(name)
     method = methods[name]

@@ -175,7 +175,7 @@ def test_known_figures(data, folder, numbers, name, least):
 
     sequence, method = open_sequence(data / folder), jx.load(name)
     found = [
-        score(method(*arguments(method, w)), w, causes_of(sequence, w), None, hdr=sequence.hdr)["psnr"]
+        score(method(*arguments(method, w)), w, causes_of(sequence, w), None, hdr=sequence.hdr).psnr
         for w in windows(sequence, numbers, past=1, future=1)
     ]
     assert np.mean(found) > least

@@ -12,6 +12,7 @@ from synthetic import make_frame, make_keyframe
 
 import jaxtrapolate as jx
 import jaxtrapolate.commands.evaluate as command
+import jaxtrapolate.evaluation.evaluate as module
 from jaxtrapolate.commands.main import main
 from jaxtrapolate.evaluation.runnable import history_costs
 from jaxtrapolate.evaluation.windows import hide
@@ -143,18 +144,18 @@ def test_a_copied_input_is_the_same(capsys, still_dump, tmp_path, monkeypatch):
     assert run(capsys, "evaluate", still_dump, *arguments)[0] == 0
     copy = tmp_path / "copy"
     shutil.copytree(still_dump, copy, copy_function=shutil.copy)
-    monkeypatch.setattr(command, "_score_window", None)  # nothing is scored anew
+    monkeypatch.setattr(module, "score_window", None)  # nothing is scored anew
     assert run(capsys, "evaluate", copy, *arguments)[0] == 0
 
 
 def test_one_method_more_keeps_the_scores_of_the_others(capsys, still_dump, tmp_path, monkeypatch):
-    asked, real = [], command._score_window
+    asked, real = [], module.score_window
 
-    def counted(sequence, window, methods, *rest):
-        asked.append((window.number, *methods))
-        return real(sequence, window, methods, *rest)
+    def counted(sequence, slot, window, generated, *rest):
+        asked.append((slot.number, *generated))
+        return real(sequence, slot, window, generated, *rest)
 
-    monkeypatch.setattr(command, "_score_window", counted)
+    monkeypatch.setattr(module, "score_window", counted)
     common = ("evaluate", still_dump, "--pictures", 0, "--output", tmp_path, "--methods")
     assert run(capsys, *common, "repeat")[0] == 0
     assert run(capsys, *common, "repeat,warp")[0] == 0
@@ -178,7 +179,10 @@ def test_figures_of_two_machines_do_not_mix(capsys, still_dump, tmp_path, monkey
     assert 'is now "Abacus 9"' in refused(capsys, *common)
 
 
-@pytest.mark.parametrize("content", ["[]", '{"repeat": 5}', '{"repeat": {"number": 1}}', "{", "[" * 100_000])
+LONGER = [pytest.param(content, marks=pytest.mark.slow) for content in ("[]", '{"repeat": 5}', "[" * 100_000)]
+
+
+@pytest.mark.parametrize("content", ["{", '{"repeat": {"number": 1}}', *LONGER])
 def test_kept_scores_of_another_shape_are_computed_again(capsys, still_dump, tmp_path, content):
     common = ("evaluate", still_dump, "--methods", "repeat", "--pictures", 0, "--frames", "1", "--output", tmp_path)
     assert run(capsys, *common)[0] == 0
@@ -192,13 +196,14 @@ def test_kept_scores_of_another_shape_are_computed_again(capsys, still_dump, tmp
     assert "0001.json: is a folder" in refused(capsys, *common)
 
 
-def test_several_frames_missing_in_a_row(capsys, tmp_path):
+@pytest.mark.parametrize("last", [3, pytest.param(4, marks=pytest.mark.slow)])
+def test_several_frames_missing_in_a_row(capsys, tmp_path, last):
     """Motion leads from frame to frame: all of them are handed over, as in Python."""
-    folder = dumped(tmp_path / "dump", range(5), colored=(0, 4))
+    folder = dumped(tmp_path / "dump", range(last + 1), colored=(0, last))
     assert run(capsys, "generate", folder, "--method", "bidirectional_image", "--output", tmp_path / "out")[0] == 0
-    frames = [open_sequence(folder).frame(n) for n in range(5)]
+    frames = [open_sequence(folder).frame(n) for n in range(last + 1)]
     method = jx.load("bidirectional_image")
-    for n in (1, 2, 3):
+    for n in range(1, last):
         right = np.asarray(method(tuple(frames[:n]), frames[n], tuple(frames[n + 1 :])))
         np.testing.assert_allclose(color(tmp_path / "out" / f"{n:04d}.exr"), right.astype(np.float16), atol=1e-3)
 

@@ -388,7 +388,9 @@ def test_stages_before_are_named(methods):
         methods["ours"].values_before("networks", methods["ours"].state, (), history, target)
 
 
-@pytest.mark.parametrize("name, rendered", [("ours", 1), ("ours", 3), ("guided", 3)])
+@pytest.mark.parametrize(
+    "name, rendered", [("ours", 1), ("ours", 3), pytest.param("guided", 3, marks=pytest.mark.slow)]
+)
 def test_what_stands_still_is_returned(methods, name, rendered):
     """Three equal rendered frames and no motion: the newest, exactly; of one alone nothing is known."""
     history, target = make_window(rendered=rendered)

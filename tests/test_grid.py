@@ -25,7 +25,7 @@ def ramp(size):
 
 
 @pytest.mark.parametrize("cell", [3, 8])
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("size", [*SIZES[:2], *(pytest.param(s, marks=pytest.mark.slow) for s in SIZES[2:])])
 def test_no_flow_returns_the_image(size, cell):
     image, depth = random(*size, 3), random(*size, 1, seed=1, low=0.5)
     warped, covered = grid_warp(image, np.zeros((*size, 2), np.float32), depth, 0.5, cell=cell)
@@ -33,7 +33,7 @@ def test_no_flow_returns_the_image(size, cell):
     assert np.array_equal(warped, image)
 
 
-@pytest.mark.parametrize("snap", [False, True])
+@pytest.mark.parametrize("snap", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_whole_pixel_translation_is_exact(snap):
     size = (20, 31)
     image, depth = random(*size, 3), random(*size, 1, seed=1, low=0.5)
@@ -44,7 +44,7 @@ def test_whole_pixel_translation_is_exact(snap):
     assert not np.asarray(covered)[:, :1].any()
 
 
-@pytest.mark.parametrize("cell", [2, 8])
+@pytest.mark.parametrize("cell", [2, pytest.param(8, marks=pytest.mark.slow)])
 def test_affine_motion_is_exact(cell):
     """A bilinear cell holds an affine flow, and its inverse is exact: all of a linear image, within rounding."""
     size = (33, 47)

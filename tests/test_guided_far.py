@@ -39,7 +39,15 @@ def expected(motion, target, source, holes, step, unlike=0.1):
 
 
 @pytest.mark.parametrize(
-    ("size", "step"), [((13, 20), 2), ((13, 20), 3), ((1, 9), 4), ((7, 1), 2), ((1, 1), 5)], ids=str
+    ("size", "step"),
+    [
+        ((13, 20), 2),
+        pytest.param((13, 20), 3, marks=pytest.mark.slow),
+        pytest.param((1, 9), 4, marks=pytest.mark.slow),
+        ((7, 1), 2),
+        ((1, 1), 5),
+    ],
+    ids=str,
 )
 def test_against_the_loop(size, step):
     arrays = inputs(*size)

@@ -41,6 +41,14 @@ CASES = {
 }
 
 
+@pytest.fixture(autouse=True)
+def not_ignored():
+    """Interrupts arrive here and in processes started from here, also where pytest was started with them ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_an_interrupt_ends_the_process(case):
     begun = time.monotonic()

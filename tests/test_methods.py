@@ -137,7 +137,7 @@ def test_nothing_is_compiled_twice(methods):
     assert method._jitted._cache_size() == 1
 
 
-def test_the_pure_function_under_grad_and_vmap():
+def test_the_pure_function_under_vmap():
     method = jx.load("guided_warp")
     windows = [window(t) for t in (4, 5)]
     batch = jax.tree.map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *[w[:2] for w in windows])
@@ -145,7 +145,11 @@ def test_the_pure_function_under_grad_and_vmap():
     single = np.stack([method(h, t) for h, t, _ in windows])
     np.testing.assert_allclose(images, single, atol=2e-5)
 
-    history, target, truth = windows[0]
+
+@pytest.mark.slow
+def test_the_pure_function_under_grad():
+    method = jx.load("guided_warp")
+    history, target, truth = window(4)
 
     def loss(motion):
         return jnp.mean(
@@ -187,7 +191,9 @@ def test_what_stands_still_stays_as_it_is(methods, name):
     assert np.array_equal(methods[name]((frame, hide(frame), frame), hide(frame)), frame.color)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (13, 11)])
+@pytest.mark.parametrize(
+    "size", [(1, 1), *(pytest.param(s, marks=pytest.mark.slow) for s in ((1, 7), (13, 11)))], ids=str
+)
 @pytest.mark.parametrize("name", NAMES)
 def test_any_size(methods, name, size):
     frames = [make_frame(t, size) for t in range(4)]

@@ -472,6 +472,7 @@ def released(data):
     ]
 
 
+@pytest.mark.slow
 def test_released_answers(released):
     weights, frames = released
     function, state = inference(extranet_from_torch(weights))

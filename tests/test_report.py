@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 from jaxtrapolate import report
+from jaxtrapolate import results as results_module
 from jaxtrapolate.errors import InputError
 from jaxtrapolate.files import write_png
 from jaxtrapolate.ops.causes import CAUSES
@@ -294,7 +295,7 @@ def test_infinite_decibels(tmp_path, infinite):
 
 
 def test_equal_images_without_decibels_have_infinitely_many():
-    equal, unknown = values.read_methods(
+    equal, unknown = values.named_methods(
         {"methods": {"a": {"psnr": None, "ssim": 1.0}, "b": {"psnr": None, "ssim": 0.9}}}
     )
     assert equal.psnr == math.inf
@@ -346,12 +347,12 @@ def test_pareto_front():
 
 
 def test_many_methods_are_told_apart():
-    methods = values.read_methods({"methods": {f"m{i}": {} for i in range(40)}})
+    methods = values.named_methods({"methods": {f"m{i}": {} for i in range(40)}})
     assert len({(m.color, m.marker) for m in methods}) == 40
 
 
 def test_best_and_reference():
-    methods = values.read_methods({"methods": {"warp": entry(30.0, 5), "b": entry(30.0, 2), "repeat": entry(9.0, 1)}})
+    methods = values.named_methods({"methods": {"warp": entry(30.0, 5), "b": entry(30.0, 2), "repeat": entry(9.0, 1)}})
     assert values.best_method(methods).name == "b"
     assert values.reference_method(methods).name == "warp"
     assert values.headline(methods[:1]) == "warp: 30.0 dB at 5.00 ms"
@@ -363,7 +364,7 @@ def test_best_and_reference():
     [(1, 1.0), ("2.5", 2.5), ("inf", math.inf), ("-Infinity", -math.inf), (math.nan, None), (True, None), ([], None)],
 )
 def test_number(value, expected):
-    assert values.number(value) == expected
+    assert results_module.number(value) == expected
 
 
 def test_texts():
@@ -444,7 +445,7 @@ def root_of(dump):
     return dict(re.findall(r'([\w-]+)="([^"]*)"', re.search(r"<html([^>]*)>", dump)[1]))
 
 
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("width", [1280, pytest.param(390, marks=pytest.mark.slow)])
 def test_browser_runs_the_script_and_moves_the_slider(tmp_path, browse, width):
     path = report.write_report(complete(tmp_path), tmp_path)
     root = root_of(browse(path, "dump-dom", f"window-size={width},1200", fragment="#selftest"))

@@ -251,7 +251,9 @@ def derivatives(solver, iterations):
     return both
 
 
-@pytest.mark.parametrize("solver, iterations", [("fixed_point", 120), ("newton", 8)])
+@pytest.mark.parametrize(
+    "solver, iterations", [pytest.param("fixed_point", 120, marks=pytest.mark.slow), ("newton", 8)]
+)
 def test_gradients_against_differences_of_the_converged_loop(x64, solver, iterations):
     """Forward and reverse, with respect to flow and fraction."""
     flow, fraction = np.float64(smooth_flow(5, 6)), np.float64(0.7)
@@ -386,8 +388,18 @@ def latest_loop(offset, depth, ratio, reach):
     return out
 
 
-@pytest.mark.parametrize("reach", [0, 1, 2])
-@pytest.mark.parametrize("size", SIZES, ids=str)
+QUICK = [((1, 6), 0), ((1, 1), 1), ((5, 7), 2)]  # each reach, and the sizes where it ends at once
+
+
+@pytest.mark.parametrize(
+    "size, reach",
+    [
+        (size, reach) if (size, reach) in QUICK else pytest.param(size, reach, marks=pytest.mark.slow)
+        for size in SIZES
+        for reach in (0, 1, 2)
+    ],
+    ids=str,
+)
 def test_latest_start_against_the_loop(size, reach):
     offset, depth = random(*size, 2, low=-2, high=2), np.round(random(*size, 1, seed=4) * 4).astype(np.float32)
     depth.flat[0] = np.nan

@@ -136,6 +136,7 @@ MORE = {
         lambda a, b, t: jx.interpolate_bidirectional(a, b, 0.4, target=t, stencil_ids=(1,)),
         *(keyframes[0], keyframes[2], keyframes[1]),
     ),
+    "interpolate_image_based": (lambda a, b: jx.interpolate_image_based(a, b, 0.4), *keyframes[:2]),
     "interpolate_run": (lambda a, b: jx.interpolate_run(a, b, factor=3), *keyframes[:2]),
     "motion_blur": (lambda a, b, c: jx.motion_blur(a, b, c, samples=1), *keyframes),
     "overlay": (
@@ -219,7 +220,10 @@ NUMBERS = {
     "iterative_search": lambda: jx.iterative_search(keyframes[0].forward_flow, STRONG),
     "latest_start": lambda: jx.latest_start(motion, STRONG, depth=depth),
     "interpolate_bidirectional": lambda: jx.interpolate_bidirectional(
-        *keyframes[:2], STRONG, epsilon_error=STRONG, epsilon_depth=STRONG, epsilon_trip=STRONG
+        *keyframes[:2],
+        STRONG,
+        search=jx.SearchOptions(epsilon=STRONG),
+        visibility=jx.VisibilityOptions(epsilon_depth=STRONG, epsilon_trip=STRONG),
     ),
     "interpolate_assisted": lambda: jx.interpolate_assisted(
         keyframes[0], keyframes[2], keyframes[1], STRONG, epsilon_depth=STRONG

@@ -17,10 +17,10 @@ from jaxtrapolate.evaluation.windows import Window, arguments, hide
 from jaxtrapolate.evaluation.windows import windows as windows_of
 from jaxtrapolate.files import open_sequence, write_unreal_frame
 from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence, flow, scene
+from jaxtrapolate.tables import parse
 from jaxtrapolate.training import Config, Optimizer, train_and_evaluate
 from jaxtrapolate.training import windows as module
 from jaxtrapolate.training.augment import crop
-from jaxtrapolate.training.config import parse
 from jaxtrapolate.training.journal import read_metrics
 from jaxtrapolate.training.windows import SEEDS, VALIDATION_SEEDS, WindowOptions, Windows, _parted, scene_window
 

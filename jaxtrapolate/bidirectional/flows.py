@@ -13,16 +13,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxtrapolate.bidirectional.assisted import DepthKind
 from jaxtrapolate.bidirectional.search import check_flow, positions, within
 from jaxtrapolate.checks import Size, check_choice, check_image
 from jaxtrapolate.ops.depth import apart as depth_apart
 from jaxtrapolate.ops.depth import changed, held, surfaces_of
-from jaxtrapolate.ops.motion import camera_motion
+from jaxtrapolate.ops.fill import covered_around
+from jaxtrapolate.ops.motion import camera_motion, carried
 from jaxtrapolate.ops.scatter import splat_source
-from jaxtrapolate.ops.warp import sample, take_rows
-from jaxtrapolate.precision import widest
-from jaxtrapolate.records import Camera, Keyframe, replace
+from jaxtrapolate.ops.warp import root, sample, take_rows
+from jaxtrapolate.precision import divide, widest
+from jaxtrapolate.records import Camera, DepthKind, Keyframe, replace
 
 _HIDDEN = 0.2  # relative: a surface whose depth changes by more is taken for another one
 
@@ -34,10 +34,8 @@ def _view_depth(camera: Camera, points: Array) -> Array:
     """
     view, projection = cast(Array, camera.view), cast(Array, camera.projection)
     seen = points @ view.T
-    square = jnp.sum(jnp.square(projection[3, :3]))
-    perspective = square > 0
     along = (seen[..., :3] @ projection[3, :3])[..., None]
-    return jnp.where(perspective, along / jnp.sqrt(jnp.where(perspective, square, 1)), -seen[..., 2:3])
+    return divide(along, root(jnp.sum(jnp.square(projection[3, :3]))), otherwise=-seen[..., 2:3])
 
 
 @jax.jit
@@ -78,15 +76,7 @@ def camera_flow(
     """
     motion = camera_motion(position, camera, other_camera, object_motion=object_motion, stencil=stencil)
     finite = jnp.all(jnp.isfinite(motion), -1, keepdims=True)
-    points = jnp.where(finite, position, 0)
-    points = jnp.concatenate([points, jnp.ones_like(points[..., :1])], -1)
-    moved = points
-    if object_motion is not None and stencil is not None:
-        ids = jnp.round(stencil).astype(jnp.int32)
-        known = (ids >= 0) & (ids < object_motion.shape[0])
-        rows = take_rows(object_motion.reshape(-1, 16), jnp.where(known, ids, 0)[..., 0])
-        carried = jnp.sum(rows.reshape(*rows.shape[:2], 4, 4) * points[..., None, :], -1)
-        moved = jnp.where(known, carried, points)
+    points, moved = carried(jnp.where(finite, position, 0), object_motion, stencil)
     change = _view_depth(other_camera, moved) - _view_depth(camera, points)
     return jnp.concatenate([motion, jnp.where(finite, change, jnp.nan)], -1)
 
@@ -111,36 +101,21 @@ class CompletedFlows:
     derived: tuple[str, ...]
 
 
-def _last(mask, *, axis, reverse):
-    """The index along an axis of the last pixel in the mask up to each pixel; -1 where there is none."""
-    index = jax.lax.broadcasted_iota(jnp.int32, mask.shape, axis)
-    if reverse:
-        count = mask.shape[axis]
-        found = jax.lax.cummin(jnp.where(mask, index, count), axis=axis, reverse=True)
-        return jnp.where(found < count, found, -1)
-    return jax.lax.cummax(jnp.where(mask, index, -1), axis=axis)
-
-
 def _fill(flow, covered, depth):
     """Uncovered pixels take the flow of one of the next covered ones left, right, above, below: that most like them.
 
     Like: the smallest difference of depth; at equal differences, or without depth, the closest; then in that order.
     """
     height, width, _ = flow.shape
-    row, column = (jax.lax.broadcasted_iota(jnp.int32, covered.shape, k) for k in (0, 1))
     rows = flow.reshape(-1, flow.shape[-1])
     best, apart = jnp.zeros_like(flow), jnp.full(covered.shape, jnp.inf, jnp.float32)
     steps = jnp.full(covered.shape, height + width, jnp.int32)
-    for axis, reverse in ((1, False), (1, True), (0, False), (0, True)):
-        found = _last(covered, axis=axis, reverse=reverse)
-        there = jnp.maximum(found, 0)
-        index = row * width + there if axis == 1 else there * width + column
-        far = jnp.abs(found - (column if axis == 1 else row))
+    for found, index, far in covered_around(covered):
         differs = jnp.zeros(covered.shape, jnp.float32)
         if depth is not None:
             differs = depth_apart(take_rows(depth.reshape(-1, 1), index), depth)[..., 0].astype(jnp.float32)
             differs = jnp.where(jnp.isnan(differs), jnp.float32(jnp.finfo(jnp.float32).max), differs)
-        better = (found >= 0) & ((differs < apart) | ((differs == apart) & (far < steps)))
+        better = found & ((differs < apart) | ((differs == apart) & (far < steps)))
         best = jnp.where(better[..., None], take_rows(rows, index), best)
         apart, steps = jnp.where(better, differs, apart), jnp.where(better, far, steps)
     return jnp.where(covered[..., None], flow, best)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image
 from jaxtrapolate.ops.strips import by_strips, rows_of
-from jaxtrapolate.ops.warp import all_finite, inside, pixel_grid, root, sample, where_finite
+from jaxtrapolate.ops.warp import Filter, all_finite, inside, pixel_grid, root, sample, where_finite
 from jaxtrapolate.precision import widest
 from jaxtrapolate.records import record
 
@@ -56,6 +56,20 @@ def positions(height: int, width: int, dtype=jnp.float32, *, top: Array | int = 
 def fetch(image: Float[Array, "h w c"], at: Float[Array, "*n 2"], filter: FlowFilter = "bilinear") -> Array:
     """The finite image at finite positions `[..., 2]`, its edge repeated beyond the frame."""
     return sample(image, at[..., 0], at[..., 1], filter=filter, product=operator.mul)  # type: ignore[arg-type]
+
+
+def fetch_finite(
+    image: Float[Array, "h w c"], at: Float[Array, "i j 2"], filter: Filter, finite: Array | None = None
+) -> Float[Array, "i j c"]:
+    """The image at finite positions; a pixel that is not finite does not spread to where it has no weight.
+
+    finite: what `all_finite` says of the image, where that is known.
+    """
+
+    def look(product, image, at):
+        return sample(image, at[..., 0], at[..., 1], filter=filter, product=product)
+
+    return look(None, image, at) if filter == "nearest" else where_finite(look, image, at, finite)
 
 
 def within(at: Float[Array, "*n 2"], height: int, width: int) -> Bool[Array, "*n"]:
@@ -180,11 +194,7 @@ def solve(leads, start, top, rows, iterations, solver, filter):
     start: complex `[rows, W]`, or `None` for the pixels themselves.
     """
     at = pair(advance(leads, start, top, rows, iterations, solver, filter))
-
-    def look(product, flow, at):
-        return sample(flow, at[..., 0], at[..., 1], filter=filter, product=product)
-
-    return at, look(None, leads.flow, at) if filter == "nearest" else where_finite(look, leads.flow, at, leads.finite)
+    return at, fetch_finite(leads.flow, at, filter, leads.finite)
 
 
 def _solve_part(sources, top, rows, *, iterations, solver, filter):

@@ -13,7 +13,8 @@ from jaxtyping import Array
 
 from jaxtrapolate.bidirectional.assisted import DepthKind
 from jaxtrapolate.bidirectional.flows import complete_flows
-from jaxtrapolate.bidirectional.interpolate import Choice, Visibility, interpolate_bidirectional
+from jaxtrapolate.bidirectional.interpolate import interpolate_bidirectional
+from jaxtrapolate.bidirectional.options import Choice, SearchOptions, VisibilityOptions, VisibilityTest
 from jaxtrapolate.bidirectional.search import FlowFilter, Solver
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.between import BETWEEN, CHAINED, PAIR, depth_of
@@ -43,8 +44,8 @@ class SearchSettings:
     choice: Choice = option(
         "depth", "which of several solutions is taken: the nearest, or that of least error", choices=Choice
     )
-    visibility: Visibility = option(
-        "round_trip", "how it is told whether a point is seen in the other frame", choices=Visibility
+    visibility: VisibilityTest = option(
+        "round_trip", "how it is told whether a point is seen in the other frame", choices=VisibilityTest
     )
     epsilon_error: float = option(0.5, "a search with a smaller error hits, in pixels", low=0)
     epsilon_depth: float = option(0.05, "depths of one point differ by less, relatively", low=0)
@@ -73,8 +74,18 @@ def _search(state, values: Values):
         depth=kind,
     )
     first, second = (replace(frame, color=compress(frame.color)) for frame in (flows.previous, flows.next))
-    how = {name: getattr(state.settings, name) for name in SearchSettings.__annotations__}
-    made = interpolate_bidirectional(first, second, values["alpha"], depth=kind, **how).color
+    how = state.settings
+    search = SearchOptions(
+        starts=how.starts,
+        iterations=how.iterations,
+        solver=how.solver,
+        filter=how.flow_filter,
+        choice=how.choice,
+        epsilon=how.epsilon_error,
+    )
+    limits = {"epsilon_depth": how.epsilon_depth, "epsilon_trip": how.epsilon_trip}
+    visible = VisibilityOptions(test=how.visibility, depth=kind, **limits)
+    made = interpolate_bidirectional(first, second, values["alpha"], search=search, visibility=visible).color
     return {"image": jnp.where(made == first.color, jnp.asarray(previous.color), expand(made))}
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_image
-from jaxtrapolate.precision import widest
+from jaxtrapolate.precision import divide, widest
 
 _SIGMA = 1.5
 _RADIUS = 5  # an 11 x 11 window
@@ -28,7 +28,7 @@ def _mean(values, mask):
     mask = jnp.broadcast_to(mask, values.shape).astype(values.dtype)
     count = jnp.sum(mask)
     total = jnp.sum(mask * jnp.where(mask > 0, values, 0))
-    return jnp.where(count > 0, total / jnp.where(count > 0, count, 1), jnp.nan)
+    return divide(total, count, otherwise=jnp.nan)
 
 
 def _squared_error(first, second, mask):
@@ -40,7 +40,16 @@ def _squared_error(first, second, mask):
 
 
 def check_pair(first: Array, second: Array, mask: Array | None) -> None:
-    """Raise unless two images and a mask fit each other."""
+    """Raises where two images and a mask do not fit each other.
+
+    Args:
+        first: `[H, W, C]`.
+        second: of the same shape.
+        mask: `[H, W, 1]`, or `None`.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, or shapes that differ.
+    """
     size = check_image("first", first)
     check_image("second", second, size=size, channels=first.shape[-1])
     if mask is not None and tuple(mask.shape) != (*size, 1):

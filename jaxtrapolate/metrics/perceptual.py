@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,8 @@ from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_inst
 from jaxtrapolate.metrics.imagenet import LPIPS_LAYERS, Net, NetworkWeights, features
 from jaxtrapolate.metrics.imagenet import network_weights as network_weights
 from jaxtrapolate.metrics.imagenet import vgg_features as vgg_features
-from jaxtrapolate.precision import widest
+from jaxtrapolate.ops.warp import root
+from jaxtrapolate.precision import divide, widest
 
 VmafModel = Literal["vmaf_v0.6.1", "vmaf_v0.6.1neg", "vmaf_4k_v0.6.1"]
 
@@ -117,8 +118,7 @@ _SMALLEST = {"vgg": 16, "alex": 31}  # pixels that leave one in the last layer
 
 def _normalized(features):
     square = jnp.sum(jnp.square(features), -1, keepdims=True)
-    lit = square > 0  # the square root has no gradient at 0
-    return jnp.where(lit, features / (jnp.sqrt(jnp.where(lit, square, 1)) + 1e-10), 0)
+    return divide(features, root(square) + 1e-10, where=square > 0)
 
 
 @partial(jax.jit, static_argnames=("net",))
@@ -163,7 +163,7 @@ def lpips(
     References:
         Zhang et al. 2018, version 0.1 of the heads, as the authors' lpips.LPIPS(net=net) in evaluation.
     """
-    check_choice("net", net, ("vgg", "alex"))
+    check_choice("net", net, get_args(Net))
     size = check_image("image", image, channels=3)
     check_image("reference", reference, size=size, channels=3)
     least = _SMALLEST[net]
@@ -258,7 +258,7 @@ def vmaf(frames: Frames, reference: Frames, *, model: VmafModel = "vmaf_v0.6.1",
     References:
         Li et al. 2016, by libvmaf. Temporary files hold both clips as raw 8-bit RGB, removed afterwards.
     """
-    check_choice("model", model, ("vmaf_v0.6.1", "vmaf_v0.6.1neg", "vmaf_4k_v0.6.1"))
+    check_choice("model", model, get_args(VmafModel))
     options = f"log_fmt=json:log_path=log.json:n_threads={int(threads)}:model=version={model}"
     log = json.loads(_compare(frames, reference, least=17, filter=f"libvmaf={options}", log="log.json"))
     values = np.array([frame["metrics"]["vmaf"] for frame in log["frames"]])

@@ -6,7 +6,7 @@ Convention:
 """
 
 import math
-from typing import Literal, cast
+from typing import Literal, cast, get_args
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +25,6 @@ HE = math.sqrt(6)
 
 LINEAR = math.sqrt(3)
 """The same without an activation."""
-
-_GATES = ("none", "light", "full")
-_ACTIVATIONS = ("none", "relu", "prelu")
 
 
 def _uniform(bound):
@@ -121,8 +118,8 @@ class Layer(nnx.Module):
         gain: float | None = None,
         rngs: nnx.Rngs,
     ):
-        check_choice("gate", gate, _GATES)
-        check_choice("activation", activation, _ACTIVATIONS)
+        check_choice("gate", gate, get_args(Gate))
+        check_choice("activation", activation, get_args(Activation))
         self.feature = convolution(inputs, outputs, size=size, stride=stride, gain=gain, rngs=rngs)
         gates = {"none": 0, "light": 1, "full": outputs}[gate]
         self.gate: nnx.Conv | None = nnx.data(None)

@@ -10,6 +10,7 @@ from jaxtrapolate.checks import check_image, check_present
 from jaxtrapolate.ops.depth import changed, surface_depth
 from jaxtrapolate.ops.holes import hole_masks
 from jaxtrapolate.ops.warp import backward_warp, in_frame
+from jaxtrapolate.precision import divide
 from jaxtrapolate.records import Frame, GBuffer, Keyframe, check_frame
 
 CAUSES = ("border", "hole", "shadow", "glossy", "edge", "rest")
@@ -86,7 +87,7 @@ def edges(gbuffer: GBuffer, *, metric_depth: bool) -> Bool[Array, "h w 1"] | Non
     if gbuffer.depth is not None:
         depth = surface_depth(gbuffer.depth, gbuffer.sky)
         bare = ~(depth < jnp.inf)
-        value = jnp.where(bare, 0, 1 / jnp.where(bare, 1, depth)) if metric_depth else jnp.where(bare, 0, depth)
+        value = divide(1, depth, where=~bare) if metric_depth else jnp.where(bare, 0, depth)
         scale = value if metric_depth else jnp.ones_like(value)
         for axis in (0, 1):
             if value.shape[axis] < 3:

@@ -20,8 +20,8 @@ def features(depth: np.ndarray) -> np.ndarray:
     height, width = depth.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float64)
     scale = _scale(height, width)
-    finite = np.isfinite(depth[..., 0]) & (depth[..., 0] > 0)
-    inverse = np.where(finite, 1 / np.where(finite, depth[..., 0].astype(np.float64), 1), 0)
+    along = depth[..., 0].astype(np.float64)
+    inverse = np.divide(1, along, out=np.zeros_like(along), where=np.isfinite(along) & (along > 0))
     inverse /= max(inverse.max(), 1e-300)
     return np.stack([(x - width / 2) / scale, (y - height / 2) / scale, np.ones_like(x), inverse], -1)
 

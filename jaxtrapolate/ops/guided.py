@@ -7,7 +7,7 @@ an occluder for a like surface, so that it fills disoccluded pixels as well.
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -250,7 +250,7 @@ def guided_warp(
     check_image("motion", motion, size=size, channels=2)
     check_image("target_guide", target_guide, size=size)
     check_image("source_guide", source_guide, size=size, channels=target_guide.shape[-1])
-    check_choice("guides", guides, ("float32", "packed"))
+    check_choice("guides", guides, get_args(Guides))
     strides = tuple(strides)
     if not (1 <= len(strides) <= 7 and len(set(strides)) == len(strides) and all(1 <= s <= 1024 for s in strides)):
         raise ValueError(f"strides: expected 1 to 7 distinct integers from 1 to 1024, got {strides}")

@@ -5,7 +5,7 @@ Convention:
 """
 
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +15,10 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_present
 from jaxtrapolate.ops.depth import surface_depth
 from jaxtrapolate.ops.warp import landing, take_rows, weigh
-from jaxtrapolate.precision import widest
+from jaxtrapolate.precision import divide, widest
 
 Mode = Literal["sum", "average", "linear", "softmax"]
 
-_MODES = ("sum", "average", "linear", "softmax")
 _NONE = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
@@ -160,7 +159,7 @@ def _splat(values, motion, weights, *, mode):
     if not normalised:
         return total
     summed, weight = total[..., :-1], total[..., -1:]
-    return jnp.where(weight > 0, summed / jnp.where(weight > 0, weight, 1), 0)
+    return divide(summed, weight)
 
 
 def splat(
@@ -205,7 +204,7 @@ def splat(
     """
     size = check_image("values", values)
     check_image("motion", motion, size=size, channels=2)
-    check_choice("mode", mode, _MODES)
+    check_choice("mode", mode, get_args(Mode))
     if mode in ("linear", "softmax"):
         weights = check_present("weights", weights, needed_by=f"mode={mode!r}")
         check_image("weights", weights, size=size, channels=1)

@@ -22,7 +22,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from matplotlib.transforms import Bbox, BboxBase
 
 from jaxtrapolate.ops.causes import CAUSES
-from jaxtrapolate.report.values import MethodResult, fixed, percent, read_methods
+from jaxtrapolate.report.values import NamedMethod, fixed, named_methods, percent
+from jaxtrapolate.results import Results
 
 _INK, _SOFT, _GRID = "#24292e", "#59616a", "#d5d9dd"
 _DARK = {_INK: "#e8ebee", _SOFT: "#a5adb6", _GRID: "#3a4149"}
@@ -82,7 +83,7 @@ def _nothing(figure: Figure, axes: Any, text: str) -> bytes:
     return _svg(figure)
 
 
-def _legend(figure: Figure, methods: Sequence[MethodResult], *, line: Literal["-", "none"]) -> None:
+def _legend(figure: Figure, methods: Sequence[NamedMethod], *, line: Literal["-", "none"]) -> None:
     """One entry a method above the axes. Names may hold any sign, so the labels are set afterwards, as plain text."""
     handles = [Line2D([], [], color=m.color, marker=m.marker, markersize=6, linestyle=line) for m in methods]
     fitting = max(1, int(66 / (max(len(_drawable(m.name)) for m in methods) + 5)))
@@ -171,7 +172,7 @@ def _isolated(function: Any, *arguments: Any) -> bytes:
         return function(*arguments)
 
 
-def plot_error_time(results: Mapping[str, Any]) -> bytes:
+def plot_error_time(results: Results | Mapping[str, Any]) -> bytes:
     """dB against milliseconds a frame (logarithmic), a labelled point for each method, and the Pareto front.
 
     On the front are the methods that no other beats in both. Infinite dB are drawn above the others and labelled so;
@@ -180,10 +181,10 @@ def plot_error_time(results: Mapping[str, Any]) -> bytes:
     Returns:
         SVG, UTF-8.
     """
-    return _isolated(_error_time, read_methods(results))
+    return _isolated(_error_time, named_methods(results))
 
 
-def _error_time(methods: Sequence[MethodResult]) -> bytes:
+def _error_time(methods: Sequence[NamedMethod]) -> bytes:
     figure, axes = _axes(3.8)
     known = [(m, m.psnr, m.ms.median) for m in methods if m.psnr is not None and m.ms.median]
     if not known:
@@ -214,24 +215,24 @@ def _error_time(methods: Sequence[MethodResult]) -> bytes:
     return _svg(figure)
 
 
-def plot_causes(results: Mapping[str, Any]) -> bytes:
+def plot_causes(results: Results | Mapping[str, Any]) -> bytes:
     """dB by cause: a row for each cause that occurs, with its share of the pixels, and a mark for each method.
 
     Returns:
         SVG, UTF-8.
     """
-    return _isolated(_causes, read_methods(results))
+    return _isolated(_causes, named_methods(results))
 
 
-def _causes(methods: Sequence[MethodResult]) -> bytes:
-    drawn = [m for m in methods if any(value is not None for value, _ in m.by_cause.values())]
-    causes = [c for c in CAUSES if any(m.by_cause.get(c, (None,))[0] is not None for m in drawn)]
+def _causes(methods: Sequence[NamedMethod]) -> bytes:
+    drawn = [m for m in methods if any(m.psnr_of(c) is not None for c in CAUSES)]
+    causes = [c for c in CAUSES if any(m.psnr_of(c) is not None for m in drawn)]
     if not causes:
         return _nothing(*_axes(1.6), "no dB by cause")
     figure, axes = _axes(0.42 * len(causes) + 1.0 + 0.12 * len(drawn))
-    placed, top = _ceiling([v for m in drawn for c in causes if (v := m.by_cause.get(c, (None,))[0]) is not None])
+    placed, top = _ceiling([v for m in drawn for c in causes if (v := m.psnr_of(c)) is not None])
     heights = iter(placed)
-    marks = {(m.name, c): next(heights) for m in drawn for c in causes if m.by_cause.get(c, (None,))[0] is not None}
+    marks = {(m.name, c): next(heights) for m in drawn for c in causes if m.psnr_of(c) is not None}
     for row, cause in enumerate(causes):
         found = [marks[m.name, cause] for m in drawn if (m.name, cause) in marks]
         axes.plot([min(found), max(found)], [row, row], color=_SOFT, linewidth=1.2, zorder=2)
@@ -243,7 +244,7 @@ def _causes(methods: Sequence[MethodResult]) -> bytes:
         )
     names = []
     for cause in causes:
-        shares = [s for m in drawn if (s := m.by_cause.get(cause, (None, None))[1]) is not None]
+        shares = [s for m in drawn if cause in m.by_cause and (s := m.by_cause[cause].share) is not None]
         names.append(f"{cause}, {percent(shares[0])}" if shares else cause)
     axes.set_yticks(range(len(causes)), names)
     axes.set_ylim(len(causes) - 0.5, -0.5)
@@ -254,16 +255,16 @@ def _causes(methods: Sequence[MethodResult]) -> bytes:
     return _svg(figure)
 
 
-def plot_frames(results: Mapping[str, Any]) -> bytes:
+def plot_frames(results: Results | Mapping[str, Any]) -> bytes:
     """dB over the scored frames, a line for each method; a gap where a frame has none.
 
     Returns:
         SVG, UTF-8.
     """
-    return _isolated(_frames, read_methods(results))
+    return _isolated(_frames, named_methods(results))
 
 
-def _frames(methods: Sequence[MethodResult]) -> bytes:
+def _frames(methods: Sequence[NamedMethod]) -> bytes:
     figure, axes = _axes(3.4)
     drawn = [m for m in methods if any(f.psnr is not None for f in m.frames)]
     if not drawn:

@@ -9,18 +9,16 @@ Non-finite values:
 """
 
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_array, check_choice, check_image
-from jaxtrapolate.precision import widest
+from jaxtrapolate.precision import divide, widest
 
 Shade = Literal["release", "paper"]
-
-_SHADES = ("release", "paper")
 
 
 def _difference(prediction, target):
@@ -42,11 +40,6 @@ def _count(chosen, like, axis=None):
     return jnp.sum(chosen, axis, dtype=like.dtype)
 
 
-def _share(total, count):
-    """total / count, 0 where the count is 0."""
-    return jnp.where(count > 0, total / jnp.where(count > 0, count, 1), 0)
-
-
 @jax.jit
 def l1_loss(prediction: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Float[Array, ""]:
     """The mean absolute difference.
@@ -64,7 +57,7 @@ def l1_loss(prediction: Float[Array, "h w c"], target: Float[Array, "h w c"]) ->
         Guo et al. 2021 (ExtraNet), eq. 4, taken over pixels and channels as in the release.
     """
     difference, finite = _difference(prediction, target)
-    return _share(jnp.sum(_absolute(difference)), _count(finite, difference))
+    return divide(jnp.sum(_absolute(difference)), _count(finite, difference))
 
 
 @jax.jit
@@ -92,7 +85,7 @@ def charbonnier_loss(
     """
     difference, finite = _difference(prediction, target)
     values = jnp.hypot(difference, jnp.asarray(epsilon, difference.dtype))  # also where a square would overflow
-    return _share(jnp.sum(jnp.where(finite, values, 0)), _count(finite, difference))
+    return divide(jnp.sum(jnp.where(finite, values, 0)), _count(finite, difference))
 
 
 @jax.jit
@@ -122,7 +115,7 @@ def hole_loss(
     check_array("mask", mask, shape=(*difference.shape[:2], 1))
     weight = jnp.where(finite, 1 - mask.astype(difference.dtype), 0)
     error = _absolute(jnp.where(weight > 0, difference, 0))  # so that what is valid does not count, whatever it holds
-    return _share(jnp.sum(weight * error), jnp.sum(weight))
+    return divide(jnp.sum(weight * error), jnp.sum(weight))
 
 
 @partial(jax.jit, static_argnames=("shade",))
@@ -155,7 +148,7 @@ def shading_loss(
     References:
         Guo et al. 2021 (ExtraNet), eq. 6.
     """
-    check_choice("shade", shade, _SHADES)
+    check_choice("shade", shade, get_args(Shade))
     difference, finite = _difference(prediction, target)
     error = _absolute(difference)
     if shade == "paper":
@@ -240,5 +233,5 @@ def relative_loss(
     difference, finite = _difference(prediction, target)
     before, _ = _difference(jax.lax.stop_gradient(guess), target)
     count = _count(finite, difference)
-    scale = _share(jnp.sum(jnp.square(before)), count) + jnp.asarray(epsilon, difference.dtype)
-    return _share(jnp.sum(jnp.square(difference)), count) / scale
+    scale = divide(jnp.sum(jnp.square(before)), count) + jnp.asarray(epsilon, difference.dtype)
+    return divide(jnp.sum(jnp.square(difference)), count) / scale
