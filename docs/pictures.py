@@ -1,7 +1,8 @@
 """Makes the pictures of the pages: what an operation does, a wrong convention of motion, the scenes, the demo.
 
 python docs/pictures.py --operations --convention --scenes
-jaxtrapolate demo && python docs/pictures.py --demo demo
+jaxtrapolate demo && python docs/pictures.py --demo demo   # or, for the same picture in less time:
+jaxtrapolate evaluate scenes:demo --size 480x270 --length 16 --methods warp,guided_warp,extranet --output demo
 """
 
 import argparse

@@ -500,7 +500,7 @@ def refusals(kind: str) -> tuple[type[Exception], ...]:
 
 def check_line(error: Exception, path: Path) -> None:
     """Raise `AssertionError` unless an error is one that is documented: one line, printable, that names the file."""
-    from jaxtrapolate.files.sequence import printable
+    from jaxtrapolate.errors import printable
 
     text = str(error)
     assert isinstance(error, OSError) or printable(path.parent) in text, f"does not name the file: {text[:200]}"

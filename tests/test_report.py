@@ -14,6 +14,9 @@ import xml.etree.ElementTree
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
 from PIL import Image
 
 from jaxtrapolate import report
@@ -21,7 +24,7 @@ from jaxtrapolate import results as results_module
 from jaxtrapolate.errors import InputError
 from jaxtrapolate.files import write_png
 from jaxtrapolate.ops.causes import CAUSES
-from jaxtrapolate.report import values
+from jaxtrapolate.report import plots, values
 from jaxtrapolate.report.pictures import Pictures
 
 HOSTILE = (
@@ -29,6 +32,10 @@ HOSTILE = (
     '"><img src=x onerror="document.documentElement.dataset.hacked=1">',
     "</style></script>--><b>$\\frac{",
     "_漢字 {{ 7*7 }} \x1b\ud800" + "long" * 30,
+)
+METHODS = (
+    *("repeat", "warp", "occlusion_warp", "guided_warp", "blend", "reproject", "half_motion", "warp_3d", "grid_warp"),
+    *("grid_extrapolate", "softmax_splat", "dis", "bidirectional_image", "bidirectional", "bidirectional_guided"),
 )
 VOID = {"meta", "img", "input", "br", "link"}
 
@@ -337,6 +344,47 @@ def test_plots_hold_each_method_and_leave_matplotlib_alone(tmp_path):
     for plot in (report.plot_error_time, report.plot_causes, report.plot_frames):
         svg = check_svg(plot(results))
         assert all(f"<!-- {name} -->" in svg for name in results["methods"])
+
+
+def boxes_of(labels, figure):
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    figure.draw_without_rendering()
+    return [Text.get_window_extent(label, renderer) for label in labels]
+
+
+@pytest.mark.parametrize("count, spread", [(2, 0.0), (8, 0.0), (8, 0.02), (12, 0.1), (16, 1.0), (16, 0.3), (3, 0.001)])
+@pytest.mark.parametrize("seed", range(3))
+def test_labels_cover_neither_points_nor_each_other(count, spread, seed):
+    """Also of points on top of each other; then a leader says whose each is."""
+    random = np.random.default_rng(seed)
+    names = [*METHODS[: count - 1], "a name of twenty-six signs"]
+    found = {
+        n: {"psnr": 30 + 6 * spread * u, "ms": {"median": 10 * 30 ** (spread * v)}}
+        for n, u, v in zip(names, random.random(count), random.random(count), strict=True)
+    }
+    found |= {"far": {"psnr": 20.0, "ms": {"median": 0.5}}}
+    methods = values.named_methods({"methods": found})
+    figure, labels = plots._error_time(methods)
+    assert [label.get_text() for label in labels] == [*names, "far"]
+    boxes = boxes_of(labels, figure)
+    axes = figure.axes[0]
+    inner = axes.get_window_extent()
+    for i, box in enumerate(boxes):
+        assert inner.x0 - 1 <= box.x0 < box.x1 <= inner.x1 + 1
+        assert inner.y0 - 1 <= box.y0 < box.y1 <= inner.y1 + 1
+        assert not any(box.overlaps(other) for other in boxes[i + 1 :])
+        for method in methods:
+            x, y = axes.transData.transform((method.ms.median, method.psnr))
+            assert not box.overlaps(Bbox.from_bounds(x - 4, y - 4, 8, 8))
+
+
+@pytest.mark.parametrize("count", [22, 40])
+def test_a_legend_where_there_is_no_place_for_labels(count):
+    found = {f"a method of a long name {i}": {"psnr": 30.0, "ms": {"median": 1.0}} for i in range(count)}
+    figure, labels = plots._error_time(values.named_methods({"methods": found}))
+    assert labels == []
+    assert len(figure.legends[0].get_texts()) == count
+    check_svg(report.plot_error_time({"methods": found}))
 
 
 def test_pareto_front():

@@ -16,8 +16,8 @@ from jaxtrapolate.errors import InputError
 from jaxtrapolate.evaluation.windows import Window, arguments, hide
 from jaxtrapolate.evaluation.windows import windows as windows_of
 from jaxtrapolate.files import open_sequence, write_unreal_frame
+from jaxtrapolate.files.tables import parse
 from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence, flow, scene
-from jaxtrapolate.tables import parse
 from jaxtrapolate.training import Config, Optimizer, train_and_evaluate
 from jaxtrapolate.training import windows as module
 from jaxtrapolate.training.augment import crop

@@ -177,13 +177,14 @@ def interpolate_assisted(
     `shade_on_miss` says, or the nearer of the two (closest-on-miss).
 
     Args:
-        previous, next: with color `[H, W, C]`, any attributes, and depth.
-        target: of the frame to be made: depth, backward_flow to `previous`, forward_flow to `next`, exact; see
+        previous: with color `[H, W, C]`, any attributes, and depth.
+        next: the frame after it, likewise.
+        target: of the frame to be generated: depth, backward_flow to `previous`, forward_flow to `next`, exact; see
             `camera_flow`. Its color is not looked at.
         alpha: in 0..1, traced.
         epsilon_depth: how far depths of one point may differ, relative to the smaller.
         filter: of the colours, as in `backward_warp`.
-        shade_on_miss: called with the mask `[H, W]` of the pixels visible in neither frame, gives their colour
+        shade_on_miss: called with the mask `[H, W]` of the pixels visible in neither frame, gives their colour 
             `[H, W, C']`.
         shade_attributes: called with the blended attributes, gives the colour `[H, W, C']`; it may close over what
             changes.
@@ -258,7 +259,9 @@ def overlay(
 
     Args:
         below: the interpolated frame, as a rule made of I-frames that leave out what is drawn now.
-        color: `[H, W, C]`. depth: `[H, W, 1]`. covered: `[H, W]`, where something was rendered.
+        color: `[H, W, C]`.
+        depth: `[H, W, 1]`.
+        covered: `[H, W]`, where something was rendered.
         epsilon_depth: by how much, relative to the smaller depth, it may lie behind and still be drawn.
 
     Returns:

@@ -51,7 +51,8 @@ def camera_flow(
 
     Args:
         position: `[H, W, 3]`, world space.
-        camera, other_camera: of this frame and of the one that the flow leads to, before or after it.
+        camera: of this frame.
+        other_camera: of the frame that the flow leads to, before or after this one.
         object_motion: `[N, 4, 4]`: for each stencil id 0..N-1 the matrix from world positions in this frame to world
             positions in the other.
         stencil: `[H, W, 1]` ids that pick the matrix; ids beyond N-1 count as static. Needed with `object_motion`.
@@ -166,9 +167,9 @@ def complete_flows(previous: Keyframe, next: Keyframe, *, depth: DepthKind = "me
     outside, or is more than 20 %: another surface.
 
     Args:
-        previous, next: of which forward_flow and backward_flow count, the flows between the two, `[H, W, 3]` or,
-            without the change of depth, `[H, W, 2]`; at least one; and depth `[H, W, 1]`, which may be absent; what is
-            not positive is nothing, and far.
+        previous: forward_flow to `next`, `[H, W, 3]` or, without the change of depth, `[H, W, 2]`; and depth
+            `[H, W, 1]`, which may be absent; what is not positive is nothing, and far.
+        next: likewise, with backward_flow to `previous`. At least one of the two flows is needed.
         depth: "metric" (distance along the view axis), or "ordinal" (only its order counts).
 
     Returns:

@@ -86,11 +86,12 @@ def interpolate_run(
     """All `factor - 1` frames between two rendered ones, in order, one scan; each starts from the offsets of the last.
 
     Args:
-        previous, next: as of `interpolate_bidirectional`.
+        previous: as of `interpolate_bidirectional`.
+        next: as of `interpolate_bidirectional`.
         factor: the frames are at alpha = k / factor, k = 1 .. factor - 1; at least 2.
         targets: as `target`, each field `[factor - 1, ...]`.
-        lights: any arrays `[factor - 1, ...]`, of which `shade_attributes(attributes, light)` gets those of its
-            frame, so that attributes are lit as the scene is then (section 9). Traced, unlike the function.
+        lights: any arrays `[factor - 1, ...]`, of which `shade_attributes(attributes, light)` gets those of its frame,
+            so that attributes are lit as the scene is then (section 9). Traced, unlike the function.
         options: of `interpolate_bidirectional`, but target and offsets.
 
     Returns:
@@ -162,17 +163,18 @@ def motion_blur(
     it and the frame before, or it and the frame after.
 
     Args:
-        previous: color `[H, W, C]`, forward_flow, depth (may be absent). current: color, both flows, depth. next:
-            color, backward_flow, depth. The flows lead from each to the next of the three.
+        previous: color `[H, W, C]`, forward_flow, depth (may be absent).
+        current: color, both flows, depth.
+        next: color, backward_flow, depth. The flows lead from each to the next of the three.
         shutter: in intervals between rendered frames, 0..2; 1/2 is a shutter of 180 degrees at their rate. Traced.
         samples: frames that are made on each side, at least 1; they are made one after the other, so that memory does
             not depend on it.
         targets: the geometry of the frames to be made, `target` of `interpolate_bidirectional`, each field
-            `[2 samples, ...]` in order of time: at k shutter / (2 samples + 1) intervals from `current`,
-            k = -samples .. samples without 0.
+            `[2 samples, ...]` in order of time: at k shutter / (2 samples + 1) intervals from `current`, k = -samples .. samples
+            without 0.
         lights: as of `interpolate_run`, `[2 samples + 1, ...]` in order of time, with the rendered frame's.
-        options: of `interpolate_bidirectional`, but target and offsets. `shade_attributes` is called for each
-            frame, the rendered one too, and what it gives is averaged.
+        options: of `interpolate_bidirectional`, but target and offsets. `shade_attributes` is called for each frame,
+            the rendered one too, and what it gives is averaged.
 
     Returns:
         `[H, W, C]`. Colours are averaged as they are: they should be linear radiance, before any tone mapping.

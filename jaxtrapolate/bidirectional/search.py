@@ -289,8 +289,9 @@ def iterative_search(
             1 - alpha for the backward flow of the frame after it. Traced.
         start: `[H, W, 2]`, positions to start from; each pixel itself by default (eq. 4 and 8).
         iterations: steps; each fetches the flow once, and one fetch more gives depth_offset and error.
-        solver: as above. filter: how the flow is fetched, "bilinear" or "nearest"; "nearest" has no derivative, so that
-            both solvers are the same there.
+        solver: as above.
+        filter: how the flow is fetched, "bilinear" or "nearest"; "nearest" has no derivative, so that both solvers are
+            the same there.
 
     Returns:
         A `Correspondence`: position, depth_offset = fraction * flow(position).z (eq. 6), error (eq. 7).

@@ -61,7 +61,8 @@ def mse(first: Float[Array, "h w c"], second: Float[Array, "h w c"], *, mask: Ar
     """The mean squared difference over all channels.
 
     Args:
-        first, second: `[H, W, C]`; the sum is taken in at least float32.
+        first: `[H, W, C]`; the sum is taken in at least float32.
+        second: of the same shape.
         mask: `[H, W, 1]`, bool or weights: the pixels that count.
 
     Returns:
@@ -85,7 +86,8 @@ def psnr(
     """Peak signal-to-noise ratio in dB: 10 log10(peak^2 / mse).
 
     Args:
-        first, second: `[H, W, C]`.
+        first: `[H, W, C]`.
+        second: of the same shape.
         peak: the largest value.
         mask: `[H, W, 1]`, bool or weights: the pixels that count.
 
@@ -123,7 +125,8 @@ def ssim_map(
     """SSIM at each pixel that is at least 5 from the border, mean over channels; `ssim` is its mean over pixels.
 
     Args:
-        first, second: `[H, W, C]`, at least 11 x 11.
+        first: `[H, W, C]`, at least 11 x 11.
+        second: of the same shape.
         peak: the largest value.
 
     Returns:
@@ -160,7 +163,8 @@ def ssim(
     """Structural similarity, mean over pixels and channels.
 
     Args:
-        first, second: `[H, W, C]`, at least 11 x 11.
+        first: `[H, W, C]`, at least 11 x 11.
+        second: of the same shape.
         peak: the largest value.
         mask: `[H, W, 1]`, bool or weights: the pixels that count, the five at each border left out.
 

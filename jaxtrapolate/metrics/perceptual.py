@@ -55,8 +55,9 @@ def flip_map(
     """The FLIP error at each pixel: the difference seen when the two images alternate on a display.
 
     Args:
-        image, reference: `[H, W, 3]`. With `hdr=False` sRGB display values, clipped to 0..1; with `hdr=True` linear
-            radiance with the primaries of sRGB, clipped at 0, looked at under exposures chosen from the reference.
+        image: `[H, W, 3]`. With `hdr=False` sRGB display values, clipped to 0..1; with `hdr=True` linear radiance with
+            the primaries of sRGB, clipped at 0, looked at under exposures chosen from the reference.
+        reference: the ground truth, likewise.
         hdr: HDR-FLIP.
         pixels_per_degree: of the visual field; by default 67, a 4K display 0.7 m wide at 0.7 m.
 
@@ -102,8 +103,10 @@ def flip(
     """The mean of `flip_map`: 0 for equal images, at most 1.
 
     Args:
-        image, reference: `[H, W, 3]`, sRGB display values, or linear radiance with `hdr=True`.
-        hdr, pixels_per_degree: as for `flip_map`.
+        image: `[H, W, 3]`, sRGB display values, or linear radiance with `hdr=True`.
+        reference: the ground truth, likewise.
+        hdr: as for `flip_map`.
+        pixels_per_degree: as for `flip_map`.
 
     Raises:
         ImportError, TypeError, ValueError: as `flip_map`.
@@ -143,8 +146,9 @@ def lpips(
     """Learned perceptual image patch similarity: the weighted squared distance of two images' deep features.
 
     Args:
-        image, reference: `[H, W, 3]`, display values in 0..1 (the network's -1..1 is made within), at least 31 x 31 for
-            "alex" and 16 x 16 for "vgg". Computed in at least float32, at the highest precision of products.
+        image: `[H, W, 3]`, display values in 0..1 (scaled to the network's -1..1 within), at least 31 x 31 for "alex" and
+            16 x 16 for "vgg". Computed in at least float32, at the highest precision of products.
+        reference: the ground truth, likewise.
         net: "alex" is the better and faster score, "vgg" the smoother loss.
         weights: of `network_weights(net)`, by default those. Under jit hand them over as an argument, or they become
             constants of the compiled program.
@@ -240,9 +244,10 @@ def vmaf(frames: Frames, reference: Frames, *, model: VmafModel = "vmaf_v0.6.1",
     """VMAF of a clip: 0..100, more is better; the predicted mean opinion of viewers, of the luma alone.
 
     Args:
-        frames, reference: the made and the true clip, `[T, H, W, 3]` or iterables of `[H, W, 3]`, at least 17 x 17:
-            uint8, or display values that are clipped to 0..1 and rounded to 8 bits. Successive frames are the display's
+        frames: the generated clip, `[T, H, W, 3]` or an iterable of `[H, W, 3]`, at least 17 x 17: uint8, or
+            display values that are clipped to 0..1 and rounded to 8 bits. Successive frames are the display's
             successive frames: motion between them counts.
+        reference: the ground truth, likewise.
         model: "vmaf_v0.6.1" for a 1080p display, "vmaf_4k_v0.6.1" for 4K, "vmaf_v0.6.1neg" gives nothing for
             sharpening.
         threads: of libvmaf.
@@ -269,7 +274,8 @@ def xpsnr(frames: Frames, reference: Frames) -> ClipScore:
     """Extended perceptually weighted PSNR of a clip's luma in dB: errors weigh less in busy and moving places.
 
     Args:
-        frames, reference: the made and the true clip, as for `vmaf`, of any size.
+        frames: the generated clip, as for `vmaf`, of any size.
+        reference: the ground truth, likewise.
 
     Returns:
         Mean of the frames' dB, and each frame's; infinite for equal frames.

@@ -93,9 +93,10 @@ class Interpolator(nnx.Module):
         """The frame between.
 
         Args:
-            first, second: `[B, H, W, 3]`, two frames one unit of time apart, in the domain that the weights were
-                trained in: `log_encode` of radiance, or display values. Any size from 1 x 1 on: inside it is padded,
-                see `pad_to_multiple`.
+            first: `[B, H, W, 3]`, in the domain that the weights were trained in:
+                `log_encode` of radiance, or display values. Any size from 1 x 1 on: inside it is padded, see
+                `pad_to_multiple`.
+            second: the frame one unit of time later, likewise.
             time: `[B]` in 0..1, 0 at the first.
 
         Returns:

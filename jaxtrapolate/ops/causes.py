@@ -33,7 +33,8 @@ def disoccluded(target: Keyframe, source: Keyframe) -> Bool[Array, "h w"]:
     surface, it was hidden or not there; where both show nothing it was not.
 
     Args:
-        target: with depth and backward_flow. source: the I-frame before it, with depth; both in one metric unit.
+        target: with depth and backward_flow.
+        source: the I-frame before it, with depth; both in one metric unit.
 
     Returns:
         Bool `[H, W]`.
@@ -149,8 +150,9 @@ def cause_map(
     more than 0.2. glossy: roughness below 0.3. edge: depth or normal jumps within 2 pixels. rest.
 
     Args:
-        target: the true frame, with its shadow. source: the rendered frame that is warped. motion: from target to
-            source.
+        target: the ground truth, with its shadow.
+        source: the rendered frame that is warped.
+        motion: from target to source.
         hidden: the exact holes (`disoccluded`); without it the union of the `hole_masks` that the buffers allow.
         metric_depth: whether depth is a distance, or only ordered.
 

@@ -108,7 +108,8 @@ def static_ids(stencil: np.ndarray, off: np.ndarray, *, least: int = 16) -> dict
     """Of each id above 0 that covers enough pixels, whether it moves as a static object would.
 
     Args:
-        stencil: `[H, W, 1]`. off: of `off_camera`.
+        stencil: `[H, W, 1]`.
+        off: of `off_camera`.
         least: pixels that have motion.
 
     Returns:

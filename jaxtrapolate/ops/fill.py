@@ -48,7 +48,8 @@ def fill_pyramid(image: Float[ArrayLike, "h w c"], covered: Bool[ArrayLike, "h w
     on, what is not covered is interpolated bilinearly from the level above.
 
     Args:
-        image: `[H, W, C]`. covered: bool `[H, W]`, False in holes.
+        image: `[H, W, C]`.
+        covered: bool `[H, W]`, False in holes.
 
     Returns:
         `[H, W, C]`; covered pixels as they are, bit for bit. Holes in a constant image get the constant. Zero where
@@ -124,7 +125,8 @@ def fill_around(
     What comes into view behind a moving object is background, and so is the farther side of the hole.
 
     Args:
-        image: `[H, W, C]`. covered: bool `[H, W]`, False in holes.
+        image: `[H, W, C]`.
+        covered: bool `[H, W]`, False in holes.
         depth: `[H, W, 1]` of the image, smaller is nearer, what is not positive is nothing, and the farthest; without
             it the closest of the four pixels is taken.
 

@@ -155,8 +155,9 @@ def grid_warp(
     the nearest cell that covers it, its place in that cell (the inverse of the bilinear map), and the colour there.
 
     Args:
-        image: `[H, W, C]`. flow: `[H, W, 2]` in pixels. depth: `[H, W, 1]`, smaller is nearer, what is not positive is
-            nothing, and the farthest; `None`: all as near.
+        image: `[H, W, C]`.
+        flow: `[H, W, 2]` in pixels.
+        depth: `[H, W, 1]`, smaller is nearer, what is not positive is nothing, and the farthest; `None`: all as near.
         fraction: of the flow, traced.
         cell: the distance of vertices in pixels, about: they are spread evenly from the first to the last pixel.
         snap: whether a vertex moves to the closest pixel (within half a cell) of a near surface's rim, where the next

@@ -211,12 +211,14 @@ def guided_warp(
          * exp(-|p + motion[p] - y|^2 / (2 sigma_space^2)) for the taps y; the `keep` largest are normalised, blended.
 
     Args:
-        image: `[H, W, C]` of the source frame, demodulated as a rule. motion: `[H, W, 2]` from target to source.
-        target_guide, source_guide: `[H, W, G]`, albedo and normal in the paper.
-        strides: of the 3 x 3 kernels, all distinct, 1 to 7 of them. The taps are the distinct pixels
-            round(p + motion[p]) + stride * (k, l); distances are measured from the unrounded place.
-        sigma_guide: in units of the guides. sigma_space: in pixels. Both > 0 (below 1e-12 they count as that); traced,
-            so that they can be fitted.
+        image: `[H, W, C]` of the source frame, demodulated as a rule.
+        motion: `[H, W, 2]` from target to source.
+        target_guide: `[H, W, G]`, albedo and normal in the paper.
+        source_guide: of the source frame, likewise.
+        strides: of the 3 x 3 kernels, all distinct, 1 to 7 of them. The taps are the distinct pixels round(p +
+            motion[p]) + stride * (k, l); distances are measured from the unrounded place.
+        sigma_guide: in units of the guides.
+        sigma_space: in pixels. Both > 0 (below 1e-12 they count as that); traced, so that they can be fitted.
         keep: how many taps are blended, 1 to 5.
         guides: "float32", or "packed": the ranking of the taps compares guides rounded to float16 (of up to 65504) and
             reads half the memory; whether that is faster depends on the machine. The weights of the taps that were
@@ -286,7 +288,9 @@ def far_motion(
     whose guides differ where the motion leads goes where its block's pixel found the best tap. Ours, no paper's.
 
     Args:
-        motion: `[H, W, 2]` from target to source. target_guide, source_guide: `[H, W, G]`.
+        motion: `[H, W, 2]` from target to source.
+        target_guide: `[H, W, G]`.
+        source_guide: `[H, W, G]`.
         holes: where the motion may be changed.
         step: in pixels, >= 1.
         unlike: squared difference of the guides, at the pixel nearest to the landing place, above which it is changed.

@@ -172,20 +172,21 @@ def hole_masks(
     the sky or the depth), and is `None` without.
 
     Args:
-        target, source: the G-buffers of the frame to be made and of the one that is warped.
+        target: the G-buffer of the frame to be generated.
+        source: the G-buffer of the frame that is warped.
         motion: `[H, W, 2]` from target to source.
         taps: "weighted" looks only at those of the four bilinear taps that have weight, so that a frame warped onto
             itself has no holes; ids are compared, not their mean. "nearest" looks at the nearest pixel alone: the
             pixels beside a silhouette, of whose taps one is wrong, are then no holes. "release" does as the authors':
-            the bilinear mean of the ids, more than 1/3 off; the largest distance over all four taps; everything
-            outside is a hole of position as well; it has no mask of depth.
+            the bilinear mean of the ids, more than 1/3 off; the largest distance over all four taps; everything outside
+            is a hole of position as well; it has no mask of depth.
         softness: 0 gives bool masks. Above 0 they are in 0..1 and differentiable: a sigmoid of the excess over the
             threshold, relative to it, over softness; the stencil's is the weight of the taps with another id.
         normal_threshold: T_n, a cosine.
         position_threshold: a number: how many times the distance between neighbouring pixels' positions (the larger of
             the two axes), plus 0.1 % of the depth, so that it needs no unit. Or (facing, grazing, per_depth): T_d =
-            facing |n_dot_v| + grazing (1 - |n_dot_v|) + per_depth * depth in the scene's unit. `None`: 2.0, but
-            the release's (7.5, 45, 0.005) in centimetres for "release".
+            facing |n_dot_v| + grazing (1 - |n_dot_v|) + per_depth * depth in the scene's unit. `None`: 2.0, but the
+            release's (7.5, 45, 0.005) in centimetres for "release".
 
     Returns:
         `HoleMasks` of `[H, W, 1]`.

@@ -27,7 +27,8 @@ def chain_motion(newer: Float[Array, "h w 2"], older: Float[Array, "h w 2"]) -> 
     """Motion over two steps: newer(p) + older(p + newer(p)).
 
     Args:
-        newer: `[H, W, 2]` from a frame to the one before it. older: `[H, W, 2]` from that to a still earlier one.
+        newer: `[H, W, 2]` from a frame to the one before it.
+        older: `[H, W, 2]` from that to a still earlier one.
 
     Returns:
         `[H, W, 2]` from the newest to the oldest of the three frames.
@@ -122,7 +123,8 @@ def camera_motion(
 
     Args:
         position: `[H, W, 3]`, world space.
-        camera, previous_camera: of this frame and of the one before.
+        camera: of this frame.
+        previous_camera: of the frame before.
         object_motion: `[N, 4, 4]`: for each stencil id 0..N-1 the matrix from world positions now to world positions in
             the previous frame.
         stencil: `[H, W, 1]` ids that pick the matrix; ids beyond N-1 count as static. Needed with `object_motion`.
@@ -165,8 +167,8 @@ def occlusion_motion(motion: Float[Array, "h w 2"], depth: Float[Array, "h w 1"]
     its own motion lands, floored and held to the frame.
 
     Args:
-        motion: `[H, W, 2]` from the target to the source frame. depth: `[H, W, 1]` of the target; what is not positive
-            is nothing, and behind all surfaces.
+        motion: `[H, W, 2]` from the target to the source frame.
+        depth: `[H, W, 1]` of the target; what is not positive is nothing, and behind all surfaces.
 
     Returns:
         `[H, W, 2]`; 0 where nothing was splatted to. A pixel that is nobody's background gets its own or a like vector.
@@ -210,7 +212,8 @@ def dilate_motion(
     The silhouettes of moving objects then carry their antialiased edge along.
 
     Args:
-        motion: `[H, W, 2]`. depth: `[H, W, 1]`, smaller is nearer; what is not positive is nothing, and far.
+        motion: `[H, W, 2]`.
+        depth: `[H, W, 1]`, smaller is nearer; what is not positive is nothing, and far.
         neighbours: "diagonal" (four, as Unreal's engine pass), "cross" (four) or "square" (eight).
 
     Returns:

@@ -60,8 +60,9 @@ def demodulate(
     there: see `jaxtrapolate.methods.hindsight`.
 
     Args:
-        color: `[H, W, 3]` linear radiance. gbuffer: with albedo; specular, metallic, sky where they are there.
-        by: "albedo+specular", "albedo", or "none" (the colour as it is).
+        color: `[H, W, 3]` linear radiance.
+        gbuffer: with albedo; specular, metallic, sky where they are there.
+        by: "albedo+specular", "albedo", or "none" (the colour unchanged).
         floor: the smallest divisor: in the dark it bounds the quotient, and noise. With 0, what reflects nothing is 0.
 
     Gradient:
@@ -92,7 +93,10 @@ def modulate(
     """Radiance with the material's texture again: the inverse of `demodulate` with the same options, to 1 ulp.
 
     Args:
-        irradiance: `[H, W, 3]`, demodulated radiance. gbuffer, by, floor: as in `demodulate`.
+        irradiance: `[H, W, 3]`, demodulated radiance.
+        gbuffer: as in `demodulate`.
+        by: as in `demodulate`.
+        floor: as in `demodulate`.
 
     Returns:
         `[H, W, 3]` linear radiance.

@@ -79,8 +79,9 @@ def splat_nearest(
 
     Args:
         values: `[H, W, C]`, what is scattered.
-        motion: `[H, W, 2]` in pixels. depth: `[H, W, 1]`, smaller is nearer; what is not positive is nothing, and as
-            far as +inf (`jaxtrapolate.ops.depth`).
+        motion: `[H, W, 2]` in pixels.
+        depth: `[H, W, 1]`, smaller is nearer; what is not positive is nothing, and as far as +inf
+            (`jaxtrapolate.ops.depth`).
         footprint: 4, the four pixel centres around the landing place (a point that lands on a centre also covers the
             next ones right and down, as a cell of pixels does), or 1, the nearest centre (ties right and down).
 
@@ -176,7 +177,8 @@ def splat(
     "softmax": sum(b exp(z) v) / sum(b exp(z)).
 
     Args:
-        values: `[H, W, C]`. motion: `[H, W, 2]` in pixels.
+        values: `[H, W, C]`.
+        motion: `[H, W, 2]` in pixels.
         weights: `[H, W, 1]`, for "linear" (not negative) and "softmax" (any; larger is more important) only.
         mode: as above.
 

@@ -79,7 +79,8 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[Image.Image], *, 
 
     Args:
         path: ends in .webp, .gif (256 colours, a hundredth of a second at the least) or .mp4 (needs imageio-ffmpeg).
-        frames: RGB images of one even size, `count` of them, at least one.
+        frames: RGB images of one even size.
+        count: how many they are, at least one.
         fps: frames a second.
 
     Raises:

@@ -83,7 +83,8 @@ def measure_pairs(
     Args:
         functions: of no arguments. A `functools.partial` of a jitted function is lowered and compiled, which is timed
             apart; all its arguments must then be arrays (or trees of them).
-        repeats: rounds that count. warmup: rounds before them that do not.
+        repeats: rounds that count.
+        warmup: rounds before them that do not.
         calls: calls in a row that make one run, before their results are waited for. More than one hides what it costs
             to start a call on an asynchronous device.
 

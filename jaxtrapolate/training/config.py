@@ -20,8 +20,8 @@ from importlib import resources
 from typing import Any, Literal
 
 from jaxtrapolate.errors import InputError
+from jaxtrapolate.files.tables import parse
 from jaxtrapolate.files.text import read_toml
-from jaxtrapolate.tables import parse
 from jaxtrapolate.training.tasks import Task, find_task
 
 Precision = Literal["float32", "bfloat16"]

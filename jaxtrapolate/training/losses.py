@@ -45,7 +45,8 @@ def l1_loss(prediction: Float[Array, "h w c"], target: Float[Array, "h w c"]) ->
     """The mean absolute difference.
 
     Args:
-        prediction, target: `[H, W, C]`.
+        prediction: `[H, W, C]`.
+        target: the ground truth, of the same shape.
 
     Returns:
         A scalar; 0 where nothing counts. The gradient is the sign of the difference over the count, 0 where it is 0.
@@ -70,7 +71,8 @@ def charbonnier_loss(
     """The mean of sqrt(d^2 + epsilon^2): the absolute difference, smooth where it is small.
 
     Args:
-        prediction, target: `[H, W, C]`.
+        prediction: `[H, W, C]`.
+        target: the ground truth, of the same shape.
         epsilon: where it bends, in units of the images.
 
     Returns:
@@ -95,7 +97,8 @@ def hole_loss(
     """The mean absolute difference in holes.
 
     Args:
-        prediction, target: `[H, W, C]`.
+        prediction: `[H, W, C]`.
+        target: the ground truth, of the same shape.
         mask: `[H, W, 1]`, 1 = valid, 0 = hole; values between count in part.
 
     Returns:
@@ -129,7 +132,8 @@ def shading_loss(
     """The mean of the largest absolute differences, the tenth of a frame where its shading may have changed.
 
     Args:
-        prediction, target: `[H, W, C]`.
+        prediction: `[H, W, C]`.
+        target: the ground truth, of the same shape.
         shade: "release": the largest in each channel, and the mean over channels; "paper": the pixels whose mean over
             channels is the largest.
         fraction: of the pixels whose target is finite (of channels at "release", in all channels at "paper"); rounded
@@ -179,10 +183,13 @@ def extranet_loss(
     """ExtraNet's loss: `l1_loss` + hole_weight `hole_loss` + shade_weight `shading_loss`.
 
     Args:
-        prediction, target: `[H, W, C]`, in the log domain.
+        prediction: `[H, W, C]`, in the log domain.
+        target: the ground truth, of the same shape.
         mask: `[H, W, 1]`, 1 = valid, 0 = hole.
-        hole_weight, shade_weight: the paper's lambdas.
-        shade, fraction: as in `shading_loss`.
+        hole_weight: of `hole_loss`, the paper's lambda.
+        shade_weight: of `shading_loss`, likewise.
+        shade: as in `shading_loss`.
+        fraction: as in `shading_loss`.
 
     Returns:
         The total, and its parts without their weights: "l1", "hole", "shade".
@@ -218,7 +225,9 @@ def relative_loss(
     Its mean over frames is what decibels average: a tenth less is 0.46 dB, in easy frames as in hard ones.
 
     Args:
-        prediction, target, guess: `[H, W, C]`.
+        prediction: `[H, W, C]`.
+        target: the ground truth, of the same shape.
+        guess: what the network improves on, of the same shape.
         epsilon: mean squared error that is added to the guess's.
 
     Returns:

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from jaxtrapolate.tables import parse
+from jaxtrapolate.files.tables import parse
 
 T = TypeVar("T")
 C = TypeVar("C")
