@@ -180,7 +180,17 @@ def test_the_list_has_every_public_function():
     assert {name for name in test_api.FUNCTIONS if "." not in name} <= names
     for module in (radiance, metrics, losses, fill):
         public = {n for n, v in vars(module).items() if callable(v) and getattr(v, "__module__", "") == module.__name__}
-        named = {"check_mask", "extranet_loss", "hole_loss", "shading_loss", "ssim_map", "Metric", "metric_names"}
+        named = {
+            "check_mask",
+            "check_pair",
+            "counted",
+            "extranet_loss",
+            "hole_loss",
+            "shading_loss",
+            "ssim_map",
+            "Metric",
+            "metric_names",
+        }
         assert {n for n in public if not n.startswith("_")} <= names | named
 
 

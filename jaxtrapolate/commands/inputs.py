@@ -264,17 +264,12 @@ def split_options(text: str) -> tuple[str, dict[str, str]]:
     return name, options
 
 
-def method_folder(text: str) -> str:
-    """The name of a folder or file for a method as it was named, with its options: guided_warp_keep=1."""
-    return re.sub(r"[^\w.+=-]", "_", text)
-
-
 def open_methods(
     names: str | Iterable[str], *, option: str = "--methods", weights: list[str] | None = None
 ) -> tuple[dict[str, Method], dict[str, str]]:
     """Methods of a comma-separated list of NAME:OPTION=VALUE:..., by what was said of each.
 
-    So that a method stands beside itself with other options; `method_folder` makes names of files of that. And of those
+    So that a method stands beside itself with other options; `jaxtrapolate.methods.options.file_name` makes names of files of that. And of those
     that have no weights, why they cannot be had. Tuples are written 1-3-5.
 
     Args:
