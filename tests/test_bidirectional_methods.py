@@ -142,7 +142,7 @@ def test_gradients_are_finite(methods, name):
 
     def loss(color, motion):
         given = (*history[:-1], replace(history[-1], color=color)), replace(target, motion=motion)
-        return jnp.sum(method.function((), (), *given, future)[1])
+        return jnp.sum(method.function(method.state, (), *given, future)[1])
 
     found = jax.grad(loss, argnums=(0, 1))(jnp.asarray(history[-1].color), jnp.asarray(target.motion))
     assert all(np.isfinite(g).all() for g in found)

@@ -10,19 +10,25 @@ import jaxtrapolate as jx
 from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.methods import Method, Stage
 from jaxtrapolate.methods.method import rendered
+from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.records import Frame, replace
 
 SIZE = (12, 18)
 
 
-def running_mean(weight=0.3):
+@settings
+class MeanSettings:
+    weight: float = option(0.3, "of the frame rendered last", low=0, high=1)
+
+
+def running_mean():
     """The mean of what was rendered, carried along the motion; a generated frame is that mean, moved on."""
 
     def along(state, values):
         return {"moved": jx.backward_warp(values["carry"], values["target"].motion)}
 
     def accumulate(state, values):
-        mean = values["moved"] + state * (values["image"] - values["moved"])
+        mean = values["moved"] + state.settings.weight * (values["image"] - values["moved"])
         return {"carry": mean, "image": mean}
 
     def show(state, values):
@@ -37,7 +43,7 @@ def running_mean(weight=0.3):
         Stage("accumulate", accumulate, past=0, on="rendered"),
         Stage("show", show, past=0),
     )
-    return Method("running_mean", stages, state=jnp.float32(weight), start=start)
+    return Method("running_mean", stages, settings=MeanSettings(), start=start)
 
 
 def sequence(count=12):
@@ -82,8 +88,8 @@ def test_the_blend_weight_is_fitted_by_gradient():
     truth = jnp.stack([jnp.asarray(make_frame(time, SIZE).color) for time in range(len(frames))])
     slope = jax.jit(jax.grad(lambda state: jnp.mean(jnp.square(scanned(method, state, frames) - truth))))
     gradient = slope(method.state)
-    assert np.isfinite(gradient)
-    assert gradient != 0
+    assert np.isfinite(gradient.settings.weight)
+    assert gradient.settings.weight != 0
 
 
 def test_stages_are_chosen_by_the_target():

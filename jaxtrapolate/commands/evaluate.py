@@ -185,8 +185,8 @@ def evaluate_into(sequence: Sequence, request: Request, folder: Path, *, reuse: 
         "machine": machine_identity(),
     }
     with open_output(folder, "evaluate", settings, fresh=request.fresh) as output:
-        trained = {n: m for n, m in request.methods.items() if jax.tree.leaves(m.state)}
-        output.agree("weights", {name: fingerprint(method.state) for name, method in trained.items()})
+        trained = {n: m for n, m in request.methods.items() if jax.tree.leaves(m.weights)}
+        output.agree("weights", {name: fingerprint(method.weights) for name, method in trained.items()})
         evaluation = Evaluation.prepare(
             sequence,
             request.methods,

@@ -29,6 +29,7 @@ from jaxtrapolate.files import Sequence, write_frame
 from jaxtrapolate.files.reader import stored_size
 from jaxtrapolate.methods import BEST_FIRST, method_names
 from jaxtrapolate.methods.method import Method, rendered
+from jaxtrapolate.methods.options import written
 from jaxtrapolate.runtime.output import open_output, write_json
 from jaxtrapolate.weights import fingerprint
 
@@ -160,7 +161,8 @@ def run(options: argparse.Namespace) -> None:
     settings = {
         **sequence.identity(),
         "method": method.name,
-        "weights": fingerprint(method.state) if jax.tree.leaves(method.state) else None,
+        "options": {o.name: written(o.value) for o in method.options if o.value != o.default},
+        "weights": fingerprint(method.weights) if jax.tree.leaves(method.weights) else None,
         "factor": factor if any(slot.virtual for slot in targets) else None,
     }
     with open_output(options.output, "generate", settings, fresh=options.fresh) as output:

@@ -1,6 +1,5 @@
 """The pictures of evaluated frames: of what methods generated, kept as it comes, and of the frames that are shown."""
 
-import re
 import shutil
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -13,15 +12,11 @@ from jaxtrapolate.evaluation.score import causes_of, display, truth_for
 from jaxtrapolate.evaluation.windows import Window
 from jaxtrapolate.files import Sequence, read_png, write_png
 from jaxtrapolate.methods.method import rendered
+from jaxtrapolate.methods.options import file_name
 from jaxtrapolate.ops.holes import hole_masks
 from jaxtrapolate.records import CHANNELS, GBuffer
 from jaxtrapolate.report import colorize_causes, colorize_error
 from jaxtrapolate.runtime.output import writable_folder
-
-
-def file_name(text: str) -> str:
-    """A method's name as a part of a file's: what is more than letters, digits, dots and dashes is an underscore."""
-    return re.sub(r"[^\w.-]+", "_", text)
 
 
 def eight_bit(image: Any) -> np.ndarray:

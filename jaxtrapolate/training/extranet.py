@@ -13,7 +13,7 @@ from jaxtyping import Array, PRNGKeyArray
 from jaxtrapolate.checks import Size, check_present
 from jaxtrapolate.evaluation.windows import Window
 from jaxtrapolate.methods.extranet import Preparation, encoded_truth, extranet, extranet_config
-from jaxtrapolate.methods.stages import demodulated
+from jaxtrapolate.methods.stages import reflecting
 from jaxtrapolate.metrics import psnr
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
 from jaxtrapolate.ops.radiance import demodulation_divisor, log_decode, tonemap
@@ -102,7 +102,7 @@ class ExtraNetTask:
         target, divisor = encoded_truth(color, buffers, preparation=preparation), jnp.ones_like(color)
         if buffers.albedo is not None:
             how: dict[str, Any] = {"by": preparation.by, "floor": preparation.floor}
-            divisor = demodulation_divisor(demodulated(buffers, preparation.sky), **how)
+            divisor = demodulation_divisor(reflecting(buffers, preparation.sky), **how)
         if buffers.sky is not None:
             target = jnp.where(buffers.sky > 0.5, jnp.nan, target)
         inputs = {name: value for name, value in values["inputs"].items() if value is not None}
