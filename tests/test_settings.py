@@ -184,6 +184,7 @@ def test_the_list_has_every_public_function():
             "check_mask",
             "check_pair",
             "counted",
+            "covered_around",
             "extranet_loss",
             "hole_loss",
             "shading_loss",

@@ -43,7 +43,10 @@ def test_a_byte_order_mark(tmp_path):
         ({"optimizer": 5}, "optimizer: expected a table, got 5"),
         ({"optimizer": {"lr": 1}}, "optimizer.lr: no such setting; there are peak_learning_rate, .*"),
         ({"optimizer": {"peak_learning_rate": "1"}}, "optimizer.peak_learning_rate: expected a number, got '1'"),
-        ({"optimizer": {"peak_learning_rate": float("nan")}}, "peak_learning_rate: expected above 0, got nan"),
+        (
+            {"optimizer": {"peak_learning_rate": float("nan")}},
+            "optimizer.peak_learning_rate: expected above 0, got nan",
+        ),
         ({"optimizer": {"floor": 2}}, "optimizer.floor: expected at least 0 and at most 1, got 2.0"),
         ({"options": []}, r"options: expected a table, got \[\]"),
         ({"options": {"crop": [1]}}, r"options.crop: expected an array of 2, got \[1\]"),
