@@ -269,8 +269,8 @@ def open_methods(
 ) -> tuple[dict[str, Method], dict[str, str]]:
     """Methods of a comma-separated list of NAME:OPTION=VALUE:..., by what was said of each.
 
-    So that a method stands beside itself with other options; `jaxtrapolate.methods.options.file_name` makes names of
-    files of that. And of those that have no weights, why they cannot be had. Tuples are written 1-3-5.
+    So that a method stands beside itself with other options. And of those that have no weights, why they cannot be had.
+    Tuples are written 1-3-5.
 
     Args:
         names: the list. option: where it was given.

@@ -1,5 +1,6 @@
 """The pictures of evaluated frames: of what methods generated, kept as it comes, and of the frames that are shown."""
 
+import re
 import shutil
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -12,11 +13,15 @@ from jaxtrapolate.evaluation.score import causes_of, display, truth_for
 from jaxtrapolate.evaluation.windows import Window
 from jaxtrapolate.files import Sequence, read_png, write_png
 from jaxtrapolate.methods.method import rendered
-from jaxtrapolate.methods.options import file_name
 from jaxtrapolate.ops.holes import hole_masks
 from jaxtrapolate.records import CHANNELS, GBuffer
 from jaxtrapolate.report import colorize_causes, colorize_error
 from jaxtrapolate.runtime.output import writable_folder
+
+
+def file_name(text: str) -> str:
+    """The name of a file for a method as it was named, with its options: guided_warp_keep=1."""
+    return re.sub(r"[^\w.+=-]", "_", text)
 
 
 def eight_bit(image: Any) -> np.ndarray:

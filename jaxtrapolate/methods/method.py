@@ -72,7 +72,7 @@ class Stage:
 
 
 def buffer(frame: Frame, name: str) -> Any:
-    """What a frame has by name, or `None`: colour, motion, camera, jitter, time, objects, or one of its `GBuffer`."""
+    """What a frame has by name, or `None`: one of its own fields, or a buffer of its `GBuffer`."""
     if name in ("color", "motion", "camera", "jitter", "time", "objects"):
         return getattr(frame, name)
     return None if frame.gbuffer is None else getattr(frame.gbuffer, name)

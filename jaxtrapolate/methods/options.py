@@ -6,7 +6,6 @@ compiling anew. All else (integers, choices, switches, tuples) sets shapes, loop
 
 import dataclasses
 import math
-import re
 from collections.abc import Mapping
 from typing import Any, TypeVar, get_args
 
@@ -117,11 +116,6 @@ def written(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return str(value).lower()
     return str(value) if isinstance(value, str | int) else f"{float(value):g}"
-
-
-def file_name(text: str) -> str:
-    """The name of a file or folder for a method as it was named, with its options: guided_warp_keep=1."""
-    return re.sub(r"[^\w.+=-]", "_", text)
 
 
 def option(
