@@ -36,6 +36,7 @@ from jaxtrapolate.methods import Method
 from jaxtrapolate.methods.extranet import Preparation, extranet
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
 from jaxtrapolate.ops.causes import CAUSES
+from jaxtrapolate.results import FrameScore
 from jaxtrapolate.runtime.timing import machine
 from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence
 from jaxtrapolate.training import Config, ExtraNetOptions, ExtraNetTask, Optimizer, train_and_evaluate
@@ -147,10 +148,12 @@ class Shared(ExtraNetTask):
 
 def configuration(variant: Variant, steps: int, seed: int) -> Config:
     """The training run of a variant."""
-    rate = Optimizer(learning_rate=2e-3, warmup=100, constant=steps // 4, floor=0.02, clip=1.0)
+    rate = Optimizer(peak_learning_rate=2e-3, warmup=100, constant=steps // 4, floor=0.02, clip=1.0)
     often = {"log_every": min(100, steps), "checkpoint_every": steps, "validate_every": steps}
     rounds = {"batch": 8, "pool": 32, "steps_per_round": 100}
-    return Config("extranet", variant.options, steps=steps, seed=seed, optimizer=rate, average=0.998, **rounds, **often)
+    return Config(
+        "extranet", variant.options, steps=steps, seed=seed, optimizer=rate, ema_decay=0.998, **rounds, **often
+    )
 
 
 class Scorer:
@@ -164,13 +167,13 @@ class Scorer:
                 (window,) = windows(sequence, [frame], past=3)
                 self._windows.append((name, window, causes_of(sequence, window)))
 
-    def __call__(self, method: Any, key: str) -> list[dict[str, Any]]:
-        """The scores of each window; methods with one key differ in their weights alone."""
+    def __call__(self, method: Any, key: str) -> list[tuple[str, FrameScore]]:
+        """Scene and scores of each window; methods with one key differ in their weights alone."""
         run = self._compiled.setdefault(key, jax.jit(method.function))
         scores = []
         for name, window, causes in self._windows:
             _, image = run(method.state, (), *arguments(method, window))
-            scores.append({"scene": name, **score(image, window, causes, None, hdr=True)})
+            scores.append((name, score(image, window, causes, None, hdr=True)))
         return scores
 
 
@@ -183,12 +186,12 @@ def guess_alone() -> Method:
     return extranet(model, preparation=PLAIN.preparation)
 
 
-def summary(runs: list[list[dict[str, Any]]], scenes: tuple[str, ...] = MOVING) -> dict[str, Any]:
+def summary(runs: list[list[tuple[str, FrameScore]]], scenes: tuple[str, ...] = MOVING) -> dict[str, Any]:
     """Mean over windows of some scenes, then mean and spread (standard deviation) over seeds."""
-    means = [mean_over_frames([s for s in scores if s["scene"] in scenes]) for scores in runs]
-    columns = {"psnr": [m["psnr"] for m in means], "ssim": [m["ssim"] for m in means]}
+    means = [mean_over_frames([s for scene, s in scores if scene in scenes]) for scores in runs]
+    columns = {"psnr": [m.psnr for m in means], "ssim": [m.metrics["ssim"] for m in means]}
     for cause in CAUSES:
-        columns[cause] = [m["by_cause"][cause]["psnr"] for m in means if cause in m["by_cause"]]
+        columns[cause] = [m.by_cause[cause].psnr for m in means if cause in m.by_cause]
     return {
         name: {"mean": float(np.mean(values)), "spread": float(np.std(values, ddof=1)) if len(values) > 1 else None}
         for name, values in columns.items()
@@ -257,7 +260,9 @@ def _write(options: argparse.Namespace) -> None:
             runs[name] = [json.loads(path.read_text()) for path in paths]
     rows = {name: summary(of) for name, of in runs.items()}
     unseen = {name: summary(of, UNSEEN) for name, of in runs.items()}
-    each = {name: [round(mean_over_frames(scores)["psnr"], 3) for scores in of] for name, of in runs.items()}
+    each = {
+        name: [round(mean_over_frames([s for _, s in scores]).psnr, 3) for scores in of] for name, of in runs.items()
+    }
     given = {k: getattr(options, k) for k in ("steps", "windows", "frame")}
     scores = {"all scenes": rows, f"on {' and '.join(UNSEEN)}": unseen, "dB by seed": each}
     content = {"machine": machine(), **given, **scores}

@@ -34,6 +34,7 @@ import jaxtrapolate as jx
 from jaxtrapolate.atomic import atomic_path
 from jaxtrapolate.bidirectional.assisted import shown
 from jaxtrapolate.bidirectional.search import positions, within
+from jaxtrapolate.precision import divide
 from jaxtrapolate.runtime.timing import machine
 from jaxtrapolate.scenes import Scene, flow, render, scene, visible
 
@@ -42,11 +43,11 @@ BELOW = (0.1, 0.5, 1.0)
 VARIANTS = {
     "default": {},
     "nearest, error": {"choice": "error"},
-    "bilinear, depth": {"flow_filter": "bilinear"},
-    "bilinear, error (paper)": {"flow_filter": "bilinear", "choice": "error"},
-    "bilinear, newton, depth": {"flow_filter": "bilinear", "solver": "newton"},
-    "bilinear, newton, error": {"flow_filter": "bilinear", "solver": "newton", "choice": "error"},
-    "bilinear, depth, 6 steps": {"flow_filter": "bilinear", "iterations": 6},
+    "bilinear, depth": {"filter": "bilinear"},
+    "bilinear, error (paper)": {"filter": "bilinear", "choice": "error"},
+    "bilinear, newton, depth": {"filter": "bilinear", "solver": "newton"},
+    "bilinear, newton, error": {"filter": "bilinear", "solver": "newton", "choice": "error"},
+    "bilinear, depth, 6 steps": {"filter": "bilinear", "iterations": 6},
     "nearest, depth, 6 steps": {"iterations": 6},
 }
 EVERYWHERE = ("default", "bilinear, error (paper)")
@@ -100,7 +101,7 @@ def total_counts(made: jx.Interpolation, exact: tuple, seen: tuple) -> jax.Array
     sums = jnp.zeros((len(KINDS), len(BELOW) + 1))
     for k, (found, weight) in enumerate(((made.forward, 1 - w), (made.backward, w))):
         truth = positions(*w.shape) + exact[k][..., :2]
-        read = made.color[..., 2 * k : 2 * k + 2] / jnp.where(weight > 0, weight, 1)[..., None]
+        read = divide(made.color[..., 2 * k : 2 * k + 2], weight[..., None])
         by_search, by_color = distance(found.position, truth), distance(read, truth)
         used = weight > 0
         visible_there, shown_there = seen[k]
@@ -138,8 +139,9 @@ def run(previous: jx.Keyframe, following: jx.Keyframe, truths: list, n: int, opt
     far, none = jnp.full((*SIZE[0], 1), jnp.inf), jnp.zeros((*SIZE[0], 2))
     offsets = jx.Offsets(jnp.float32(0.5), none, none, far, far)  # of no frame yet
     sums = np.zeros((len(KINDS), len(BELOW) + 1))
+    search = jx.SearchOptions(**options)
     for k, (exact, seen) in enumerate(truths, 1):
-        made = jx.interpolate_bidirectional(previous, following, k / n, offsets=offsets, **options)
+        made = jx.interpolate_bidirectional(previous, following, k / n, offsets=offsets, search=search)
         offsets = made.offsets
         sums += np.asarray(total_counts(made, exact, seen), float)
     return sums

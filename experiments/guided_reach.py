@@ -3,7 +3,7 @@
     python experiments/guided_reach.py --output experiments/results/guided_reach.json
 
 A held-back frame of one training seed of each moving scene, by size: dB over the frame and in exact holes, by how many
-rows the kernels of 10 pixels are taken to suit (`jaxtrapolate.methods.warping.guided`).
+rows the kernels of 10 pixels are taken to suit (its option `rows`).
 """
 
 import argparse
@@ -17,7 +17,7 @@ from rich.table import Table
 from jaxtrapolate.atomic import atomic_path
 from jaxtrapolate.evaluation.score import causes_of, score
 from jaxtrapolate.evaluation.windows import arguments, windows
-from jaxtrapolate.methods.warping import guided
+from jaxtrapolate.methods import load
 from jaxtrapolate.runtime.timing import machine
 from jaxtrapolate.scenes import TRAINING_SEEDS, SceneSequence, scene_names
 
@@ -32,11 +32,11 @@ def scores(scene: str, size: tuple[int, int], frame: int) -> dict[str, dict]:
     (window,) = windows(sequence, [frame], past=2)
     causes, found = causes_of(sequence, window), {}
     for rows in ROWS:
-        method = guided(rows=rows)
+        method = load("guided_warp", rows=rows)
         row = score(method(*arguments(method, window)), window, causes, None, hdr=True, metrics=())
         found[str(rows)] = {
-            "whole": row["psnr"],
-            "hole": row["by_cause"].get("hole", {}).get("psnr"),
+            "whole": row.psnr,
+            "hole": row.by_cause["hole"].psnr if "hole" in row.by_cause else None,
         }
     return found
 

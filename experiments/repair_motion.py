@@ -32,7 +32,7 @@ from jaxtrapolate.scenes import flow, keyframe, render, scene, visible
 
 KINDS = ("noise", "wrong object", "quantised")
 PENALTIES = {"photometric": 0.0, "photometric and smooth": 0.003}
-OPTIONS = {"flow_filter": "bilinear"}
+OPTIONS = {"search": jx.SearchOptions(filter="bilinear")}
 HELD_OUT = (0.25, 0.75)
 SMALL = 1e-2  # of the Charbonnier penalty, in tone-mapped colour
 SPOILT = 0.5  # pixels

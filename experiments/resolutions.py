@@ -94,7 +94,9 @@ def main() -> None:
                 for sequence, window in here:
                     image = method(*arguments(method, window))
                     rows.append(score(image, window, causes_of(sequence, window), None, hdr=True))
-                errors[name] = mean_over_frames(rows) | {"frames": [row["psnr"] for row in rows]}
+                mean = mean_over_frames(rows).to_json()
+                whole = ("psnr", "ssim", "by_cause")
+                errors[name] = {k: mean[k] for k in whole} | {"frames": [row.psnr for row in rows]}
                 print(size, name, round(errors[name]["psnr"], 2), flush=True)
             content.setdefault("errors", {})[size] = errors
         if not options.errors:

@@ -15,13 +15,19 @@ from .bidirectional.assisted import overlay as overlay
 from .bidirectional.flows import CompletedFlows as CompletedFlows
 from .bidirectional.flows import camera_flow as camera_flow
 from .bidirectional.flows import complete_flows as complete_flows
+from .bidirectional.image_based import interpolate_image_based as interpolate_image_based
 from .bidirectional.interpolate import interpolate_bidirectional as interpolate_bidirectional
+from .bidirectional.options import SearchOptions as SearchOptions
+from .bidirectional.options import VisibilityOptions as VisibilityOptions
 from .bidirectional.runs import interpolate_run as interpolate_run
 from .bidirectional.runs import motion_blur as motion_blur
 from .bidirectional.search import Correspondence as Correspondence
 from .bidirectional.search import iterative_search as iterative_search
 from .bidirectional.starts import dual_start as dual_start
 from .bidirectional.starts import latest_start as latest_start
+from .errors import InputError as InputError
+from .evaluation.evaluate import evaluate as evaluate
+from .files import open_sequence as open_sequence
 from .methods import Method as Method
 from .methods import Stage as Stage
 from .methods import load as load
@@ -58,4 +64,5 @@ from .records import Frame as Frame
 from .records import GBuffer as GBuffer
 from .records import Keyframe as Keyframe
 from .records import replace as replace
+from .results import Results as Results
 from .runtime.memory import keep_memory as keep_memory

@@ -8,7 +8,10 @@ under `jax_enable_x64` as well, and nothing is promoted implicitly, so that `jax
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array
 
 _DOUBLE = (np.dtype(np.float64), np.dtype(np.complex128))
 
@@ -20,3 +23,17 @@ def widest(*values: Any) -> np.dtype:
     """
     double = any(value.dtype in _DOUBLE for value in values)
     return jax.dtypes.canonicalize_dtype(np.float64 if double else np.float32)
+
+
+def divide(numerator: ArrayLike, denominator: Array, *, where: Array | None = None, otherwise: ArrayLike = 0) -> Array:
+    """numerator / denominator where that is allowed, `otherwise` elsewhere; with finite derivatives in both.
+
+    Args:
+        numerator: broadcast against the denominator.
+        denominator: mostly a sum of weights, a count or a length.
+        where: bool; by default where the denominator is positive, so that 0 and NaN are not.
+        otherwise: the value elsewhere, whose derivative counts there.
+    """
+    where = denominator > 0 if where is None else where
+    # the inner `where` is for the derivative: that of the quotient at 0 is NaN, and 0 * NaN is no 0
+    return jnp.where(where, numerator / jnp.where(where, denominator, 1), otherwise)

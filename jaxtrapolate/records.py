@@ -25,6 +25,10 @@ Units = Literal["pixels", "uv", "ndc"]
 YAxis = Literal["down", "up"]
 """How motion vectors may be stated: see `jaxtrapolate.convert_motion`."""
 
+DepthKind = Literal["metric", "ordinal"]
+"""What depth is: the distance along the view axis, or numbers of which only the order counts."""
+DepthOrAbsent = Literal["metric", "ordinal", "absent"]
+
 
 def record(cls: type[R]) -> type[R]:
     """Register a frozen dataclass as a pytree whose fields are all leaves or subtrees."""
@@ -83,7 +87,8 @@ class Frame:
 
     color `[H, W, 3]`: linear radiance; `None` where only the buffers were drawn. motion `[H, W, 2]`: pixels to add to
     reach the frame before it in the sequence handed over, unjittered. jitter `[2]`: sub-pixel offset of the samples in
-    pixels. time: scalar, in frames.
+    pixels. time: scalar, in frames. objects `[N, 4, 4]`: for the stencil's ids 1 to N the rigid map of the world now to
+    that of the frame before it, column vectors.
     """
 
     color: Float[Array, "h w 3"] | None = None
@@ -92,6 +97,7 @@ class Frame:
     camera: Camera | None = None
     jitter: Float[Array, "2"] | None = None
     time: Float[Array, ""] | float | None = None
+    objects: Float[Array, "n 4 4"] | None = None
 
 
 @record
@@ -153,6 +159,8 @@ def check_frame(name: str, frame: Frame, *, size: Size | None = None) -> Size | 
         check_camera(f"{name}.camera", frame.camera)
     if frame.jitter is not None:
         check_array(f"{name}.jitter", frame.jitter, shape=(2,))
+    if frame.objects is not None:
+        check_array(f"{name}.objects", frame.objects, shape=("N", 4, 4))
     return size
 
 

@@ -110,10 +110,10 @@ def test_shade_on_miss():
     depth[2, 3] = previous.depth[2, 3]
     target = jx.replace(target, depth=jnp.asarray(depth))
 
-    def shader(mask):
+    def shade(mask):
         return jnp.where(mask[..., None], 0.25, jnp.nan) * jnp.ones((1, 1, 3))
 
-    made = jx.interpolate_assisted(previous, next, target, 0.5, shader=shader)
+    made = jx.interpolate_assisted(previous, next, target, 0.5, shade_on_miss=shade)
     expected = np.full((H, W, 3), 0.25, np.float32)
     expected[2, 3] = previous.color[2, 3]
     np.testing.assert_array_equal(made.color, expected)

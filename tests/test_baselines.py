@@ -342,7 +342,7 @@ def test_gradients_are_finite_and_there(methods, name):
 
     def loss(color, motion):
         frames = [tuple(replace(f, color=color, motion=motion) for f in given) for given in (history, future)]
-        return jnp.sum(jnp.square(method.function((), (), frames[0], target, frames[1])[1]))
+        return jnp.sum(jnp.square(method.function(method.state, (), frames[0], target, frames[1])[1]))
 
     frame = (future or history)[0]
     gradients = jax.jit(jax.grad(loss, argnums=(0, 1)))(jnp.asarray(frame.color), jnp.asarray(frame.motion))
@@ -376,7 +376,9 @@ def test_a_stage_on_the_host_is_never_traced():
     assert len(log) == 2
     assert not any(issubclass(kind, jax.core.Tracer) for kind in log)
     assert [f._cache_size() for f in method._compiled_rows.values()] == [1, 1]  # type: ignore[attr-defined]
-    np.testing.assert_allclose(method.function((), (), history, Frame())[1], 2 * history[0].color + 1, rtol=1e-6)
+    np.testing.assert_allclose(
+        method.function(method.state, (), history, Frame())[1], 2 * history[0].color + 1, rtol=1e-6
+    )
     np.testing.assert_allclose(stages(method, history, Frame(), ())["image"], 2 * history[0].color + 1, rtol=1e-6)
     with pytest.raises(TypeError, match="'hosted', stage 'second': runs on the host"):
         jax.jit(method.function)((), (), history, Frame())

@@ -19,6 +19,7 @@ pytestmark = pytest.mark.usefixtures("strict")
 
 H, W = 6, 12
 STEPS = 4
+ONE_START = jx.SearchOptions(starts=("default",))
 
 
 def keyframe(color, depth=None, forward=None, backward=None, stencil=None):
@@ -117,9 +118,7 @@ def test_against_the_loop(filter, starts):
         keyframe(colors[0], depths[0], forward=flow),
         keyframe(colors[1], depths[1], backward=back),
         jnp.float32(alpha),
-        starts=names,
-        flow_filter=filter,
-        choice="error",
+        search=jx.SearchOptions(starts=names, filter=filter, choice="error"),
     )
     frames = (colors[0], depths[0], flow), (colors[1], depths[1], back)
     color, cases, depth = interpolate_loop(*frames, np.float32(alpha), filter=filter, starts=starts)
@@ -203,9 +202,11 @@ def test_at_the_ends_the_frames_are_returned_bit_for_bit(alpha):
     "options",
     [
         {},
-        *(pytest.param(o, marks=pytest.mark.slow) for o in ({"choice": "error"}, {"flow_filter": "bilinear"})),
-        {"visibility": "round_trip"},
+        pytest.param({"search": jx.SearchOptions(choice="error")}, marks=pytest.mark.slow),
+        pytest.param({"search": jx.SearchOptions(filter="bilinear")}, marks=pytest.mark.slow),
+        {"visibility": jx.VisibilityOptions(test="round_trip")},
     ],
+    ids=["default", "error", "bilinear", "round trip"],
 )
 def test_better_than_blending(options):
     previous, next = moving()
@@ -236,7 +237,7 @@ def test_a_bar_before_a_wall():
 def test_both_hit_and_differ_the_nearer_with_its_second_chance():
     """Only the default start: at pixels that the bar reaches at t + 1 only, one search stays on the wall."""
     previous, next = layers()
-    made = jx.interpolate_bidirectional(previous, next, 0.5, starts=("default",))
+    made = jx.interpolate_bidirectional(previous, next, 0.5, search=ONE_START)
     color, case, weight = numbers(made)
     at = 13  # the forward search stays on the wall at 13, the backward one finds the bar
     assert case[1, at] == CASES.index("nearer")
@@ -252,7 +253,7 @@ def test_a_nearer_point_that_the_other_frame_hides_is_taken_alone():
     # something in front of all covers the bar at t
     depth = np.array(previous.depth)
     depth[1, 10] = 1
-    made = jx.interpolate_bidirectional(jx.replace(previous, depth=jnp.asarray(depth)), next, 0.5, starts=("default",))
+    made = jx.interpolate_bidirectional(jx.replace(previous, depth=jnp.asarray(depth)), next, 0.5, search=ONE_START)
     assert np.asarray(made.weight)[1, 13, 0] == 1
     np.testing.assert_allclose(np.asarray(made.color)[1, 13], 0.9, atol=1e-6)
 
@@ -268,7 +269,7 @@ def one_sided(*, hidden=False):
 @pytest.mark.parametrize("hidden", [False, True])
 def test_one_hits(hidden):
     previous, next = one_sided(hidden=hidden)
-    color, case, weight = numbers(jx.interpolate_bidirectional(previous, next, 0.5, starts=("default",)))
+    color, case, weight = numbers(jx.interpolate_bidirectional(previous, next, 0.5, search=ONE_START))
     inner = np.s_[1:-1, 2:-2]
     np.testing.assert_array_equal(case[inner], CASES.index("one"))
     np.testing.assert_array_equal(weight[inner], 1 if hidden else 0.5)
@@ -282,7 +283,9 @@ def test_neither_hits():
     back = np.zeros((H, W, 3), np.float32)
     back[..., 0] = np.where(np.arange(W) % 2, 1.5, -1.5)
     next = jx.replace(next, backward_flow=jnp.asarray(back))
-    made = jx.interpolate_bidirectional(previous, next, 0.5, starts=("default",), epsilon_error=-1.0, iterations=1)
+    made = jx.interpolate_bidirectional(
+        previous, next, 0.5, search=jx.SearchOptions(starts=("default",), epsilon=-1.0, iterations=1)
+    )
     color, case, weight = numbers(made)
     np.testing.assert_array_equal(case, CASES.index("neither"))
     smaller = np.asarray(made.forward.error < made.backward.error)[..., 0][1:-1, 2:-2]
@@ -306,7 +309,9 @@ def test_a_search_that_ends_outside_misses():
 def test_the_choice_among_starts(choice, expected):
     """Both starts hit without error: by depth the bar wins, by error the first, which stays on the wall."""
     previous, next = layers()
-    made = jx.interpolate_bidirectional(previous, next, 0.5, starts=("default", "dual"), choice=choice)
+    made = jx.interpolate_bidirectional(
+        previous, next, 0.5, search=jx.SearchOptions(starts=("default", "dual"), choice=choice)
+    )
     at = np.asarray(made.forward.position)[1, 13, 0]
     assert np.asarray(previous.depth)[1, int(at), 0] == expected
 
@@ -324,7 +329,7 @@ def test_without_depth_a_round_trip_decides():
         color[1, [0, 1, 2, 10, 11, 20, 23], 0], [0.15, 0.15, 0.15, 0.85, 0.85, 0.15, 0.15], atol=1e-6
     )
     # wall that the bar covers in the other frame: the bar's flow does not lead back
-    inside = jx.interpolate_bidirectional(previous, next, 0.5, visibility="inside")
+    inside = jx.interpolate_bidirectional(previous, next, 0.5, visibility=jx.VisibilityOptions(test="inside"))
     assert (np.asarray(inside.weight) == 0.5).mean() > (weight == 0.5).mean()
 
 
@@ -339,10 +344,24 @@ def test_flows_without_a_change_of_depth():
 
 def test_ordinal_depth_is_compared_absolutely():
     previous, next = layers(near=0.2, far=0.6)
-    color, case, _ = numbers(jx.interpolate_bidirectional(previous, next, 0.5, depth="ordinal", starts=("default",)))
+    color, case, _ = numbers(
+        jx.interpolate_bidirectional(
+            previous,
+            next,
+            0.5,
+            search=ONE_START,
+            visibility=jx.VisibilityOptions(depth="ordinal"),
+        )
+    )
     assert case[1, 13] == CASES.index("nearer")
     np.testing.assert_allclose(color[1, 13], 0.85, atol=1e-6)
-    loose = jx.interpolate_bidirectional(previous, next, 0.5, depth="ordinal", starts=("default",), epsilon_depth=0.5)
+    loose = jx.interpolate_bidirectional(
+        previous,
+        next,
+        0.5,
+        search=ONE_START,
+        visibility=jx.VisibilityOptions(depth="ordinal", epsilon_depth=0.5),
+    )
     assert np.asarray(loose.case)[1, 13] == CASES.index("agree")
 
 
@@ -372,7 +391,9 @@ def test_offsets_start_the_next_frame():
     """With them alone the searches begin where the last ended; without, such a start is left out."""
     previous, next = layers()
     first = jx.interpolate_bidirectional(previous, next, 0.25)
-    made = jx.interpolate_bidirectional(previous, next, 0.5, starts=("latest",), offsets=first.offsets)
+    made = jx.interpolate_bidirectional(
+        previous, next, 0.5, search=jx.SearchOptions(starts=("latest",)), offsets=first.offsets
+    )
     np.testing.assert_allclose(np.asarray(made.color)[1, 8:14, 0], 0.85, atol=1e-6)
     np.testing.assert_allclose(first.offsets.forward + made.forward.position * 0 + first.forward.position,
                                np.stack(np.meshgrid(np.arange(24), np.arange(4)), -1), atol=1e-5)  # fmt: skip
@@ -389,9 +410,9 @@ def test_attributes_are_shaded_in_the_frame_made():
         return attributes[..., :2] * attributes[..., 2:3]
 
     plain = jx.interpolate_bidirectional(previous, next, 0.5)
-    made = jx.interpolate_bidirectional(previous, next, 0.5, shade=shade)
+    made = jx.interpolate_bidirectional(previous, next, 0.5, shade_attributes=shade)
     np.testing.assert_allclose(made.color, shade(np.asarray(plain.color)), rtol=1e-6)
-    assert jx.interpolate_run(previous, next, factor=3, shade=shade).shape == (2, H, W, 2)
+    assert jx.interpolate_run(previous, next, factor=3, shade_attributes=shade).shape == (2, H, W, 2)
 
 
 @pytest.mark.slow
@@ -436,7 +457,7 @@ def test_the_color_alone_is_that_of_all_outputs():
 
     def make(first, second, flow, depth):
         frames = keyframe(first, depth, forward=flow), keyframe(second, depth, backward=-flow)
-        return jx.interpolate_bidirectional(*frames, 0.4, starts=("default",), iterations=1)
+        return jx.interpolate_bidirectional(*frames, 0.4, search=jx.SearchOptions(starts=("default",), iterations=1))
 
     made = make(*given)
     assert {"agree", "nearer"} <= {CASES[k] for k in np.unique(np.asarray(made.case))}
@@ -456,7 +477,8 @@ def test_gradients_against_differences(x64):
     def total(first, second, flow, alpha):
         previous = keyframe(first, depth, forward=flow)
         next = keyframe(second, 2 * depth, backward=-flow * 0.98)  # farther, so that the forward search counts
-        options = {"starts": ("default",), "iterations": 40, "flow_filter": "bilinear", "visibility": "round_trip"}
+        search = jx.SearchOptions(starts=("default",), iterations=40, filter="bilinear")
+        options = {"search": search, "visibility": jx.VisibilityOptions(test="round_trip")}
         made = jx.interpolate_bidirectional(previous, next, alpha, **options)
         return jnp.sum(cotangent * made.color)
 
@@ -472,7 +494,7 @@ def test_gradients_stay_finite():
 
     def total(first, flow, depth, alpha, epsilon):
         bad = jx.replace(previous, color=first, forward_flow=flow, depth=depth)
-        made = jx.interpolate_bidirectional(bad, next, alpha, epsilon_error=epsilon)
+        made = jx.interpolate_bidirectional(bad, next, alpha, search=jx.SearchOptions(epsilon=epsilon))
         return jnp.sum(made.color) + jnp.sum(made.depth)
 
     given = (previous.color, jnp.asarray(flow), previous.depth, jnp.float32(0.5), jnp.float32(0.5))
@@ -493,17 +515,31 @@ def test_gradients_stay_finite():
         ({"previous.forward_flow": None}, ValueError, "previous.forward_flow: absent .*complete_flows"),
         ({"next.backward_flow": None}, ValueError, "next.backward_flow: absent"),
         ({"previous.depth": jnp.ones((H, W, 2))}, ValueError, r"previous.depth: expected shape \[6, 12, 1\]"),
-        ({"solver": "secant"}, ValueError, "solver: expected one of"),
-        ({"starts": ("best",)}, ValueError, "starts: expected one of 'default', 'dual', 'latest', got 'best'"),
-        ({"choice": "nearest"}, ValueError, "choice: expected one of 'error', 'depth'"),
-        ({"depth": "relative"}, ValueError, "depth: expected one of 'metric', 'ordinal'"),
-        ({"visibility": "none"}, ValueError, "visibility: expected one of"),
-        ({"visibility": "depth", "depth": "ordinal"}, ValueError, "visibility: 'depth' needs metric depth"),
+        ({"search": jx.SearchOptions(solver="secant")}, ValueError, "solver: expected one of"),
+        (
+            {"search": jx.SearchOptions(starts=("best",))},
+            ValueError,
+            "starts: expected one of 'default', 'dual', 'latest', got 'best'",
+        ),
+        ({"search": jx.SearchOptions(choice="nearest")}, ValueError, "choice: expected one of 'error', 'depth'"),
+        (
+            {"visibility": jx.VisibilityOptions(depth="relative")},
+            ValueError,
+            "depth: expected one of 'metric', 'ordinal'",
+        ),
+        ({"visibility": jx.VisibilityOptions(test="none")}, ValueError, "test: expected one of"),
+        (
+            {"visibility": jx.VisibilityOptions(test="depth", depth="ordinal")},
+            ValueError,
+            "test='depth' needs metric depth",
+        ),
         ({"filter": "cubic"}, ValueError, "filter: expected one of"),
-        ({"flow_filter": "bicubic"}, ValueError, "filter: expected one of 'bilinear', 'nearest'"),
-        ({"reach": -1}, ValueError, "reach: .* got -1"),
+        ({"search": jx.SearchOptions(filter="bicubic")}, ValueError, "filter: expected one of 'bilinear', 'nearest'"),
+        ({"search": jx.SearchOptions(reach=-1)}, ValueError, "reach: .* got -1"),
         ({"alpha": jnp.ones(2)}, ValueError, r"alpha: expected shape \[\], got \[2\]"),
-        ({"stencil_ids": (1,)}, ValueError, "stencil_ids, target: expected both or neither"),
+        ({"stencil_ids": (1,)}, ValueError, "stencil_ids: expected None without a target"),
+        ({"search": {"reach": 1}}, TypeError, "search: expected SearchOptions, got dict"),
+        ({"visibility": jx.VisibilityOptions(epsilon_trip=jnp.ones(2))}, ValueError, r"epsilon_trip: expected shape"),
         ({"target_mode": "draw"}, ValueError, "target_mode: expected one of 'reproject', 'render'"),
     ],
 )

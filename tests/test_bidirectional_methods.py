@@ -142,7 +142,7 @@ def test_gradients_are_finite(methods, name):
 
     def loss(color, motion):
         given = (*history[:-1], replace(history[-1], color=color)), replace(target, motion=motion)
-        return jnp.sum(method.function((), (), *given, future)[1])
+        return jnp.sum(method.function(method.state, (), *given, future)[1])
 
     found = jax.grad(loss, argnums=(0, 1))(jnp.asarray(history[-1].color), jnp.asarray(target.motion))
     assert all(np.isfinite(g).all() for g in found)
@@ -175,7 +175,7 @@ def test_known_figures(data, folder, numbers, name, least):
 
     sequence, method = open_sequence(data / folder), jx.load(name)
     found = [
-        score(method(*arguments(method, w)), w, causes_of(sequence, w), None, hdr=sequence.hdr)["psnr"]
+        score(method(*arguments(method, w)), w, causes_of(sequence, w), None, hdr=sequence.hdr).psnr
         for w in windows(sequence, numbers, past=1, future=1)
     ]
     assert np.mean(found) > least

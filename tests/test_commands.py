@@ -13,6 +13,7 @@ from jaxtrapolate.commands.main import main
 from jaxtrapolate.commands.tables import print_table
 from jaxtrapolate.files import read_exr, read_png, write_png, write_unreal_frame
 from jaxtrapolate.files.packed import encode_motion
+from jaxtrapolate.results import Results
 
 SIZE = (32, 48)
 
@@ -118,22 +119,22 @@ def test_evaluate_writes_results_report_and_pictures(capsys, dump, tmp_path):
 
 
 def test_evaluate_goes_on_where_it_was(capsys, dump, tmp_path, monkeypatch):
-    import jaxtrapolate.commands.evaluate as command
+    import jaxtrapolate.evaluation.evaluate as module
 
     arguments = ("evaluate", dump, "--methods", "repeat", "--output", tmp_path, "--pictures", 0)
-    scored, real = [], command._score_window
+    scored, real = [], module.score_window
 
-    def interrupted(sequence, window, *rest):
+    def interrupted(sequence, slot, *rest):
         if len(scored) == 2:
             raise KeyboardInterrupt
-        scored.append(window.number)
-        return real(sequence, window, *rest)
+        scored.append(slot.number)
+        return real(sequence, slot, *rest)
 
-    monkeypatch.setattr(command, "_score_window", interrupted)
+    monkeypatch.setattr(module, "score_window", interrupted)
     assert run(capsys, *arguments)[0] == 130
     assert not (tmp_path / "results.json").exists()
     first, scored[:] = list(scored), []
-    monkeypatch.setattr(command, "_score_window", lambda s, w, *r: scored.append(w.number) or real(s, w, *r))
+    monkeypatch.setattr(module, "score_window", lambda s, w, *r: scored.append(w.number) or real(s, w, *r))
     assert run(capsys, *arguments)[0] == 0
     assert first == [1, 3]
     assert scored == [5, 7]
@@ -352,7 +353,7 @@ def test_brackets_are_printed(capsys):
         "skipped": {"dis": 'pip install "jaxtrapolate[flow]"'},
         "notes": ["[a]"],
     }
-    print_table(results, terminal())
+    print_table(Results.from_json(results), terminal())
     out = capsys.readouterr().out
     for text in ("clip[final]", '"jaxtrapolate[flow]"', "note: [a]"):
         assert text in out

@@ -10,18 +10,21 @@ from PIL import Image
 from synthetic import SyntheticSequence, make_frame, make_keyframe
 
 import jaxtrapolate as jx
-import jaxtrapolate.commands.evaluate as command
+import jaxtrapolate.evaluation.evaluate as module
 from jaxtrapolate.commands import inputs as inputs_module
 from jaxtrapolate.commands.inputs import named_inputs
 from jaxtrapolate.commands.main import main
-from jaxtrapolate.commands.video import _shown
 from jaxtrapolate.errors import InputError
+from jaxtrapolate.evaluation import video
+from jaxtrapolate.evaluation.evaluate import Evaluation
+from jaxtrapolate.evaluation.pictures import Gallery, eight_bit
 from jaxtrapolate.evaluation.score import display, mean_over_inputs
 from jaxtrapolate.evaluation.windows import windows
 from jaxtrapolate.files import write_unreal_frame
 from jaxtrapolate.metrics import Metric
 from jaxtrapolate.metrics import registry as metrics_module
 from jaxtrapolate.metrics.perceptual import ClipScore
+from jaxtrapolate.results import CauseScore, MethodResult, RunTime
 from jaxtrapolate.scenes import TEST_SEEDS, scene_names
 
 SIZE = (32, 48)
@@ -159,15 +162,15 @@ def test_nothing_that_can_be_used(capsys, tmp_path):
 
 
 def test_a_killed_run_goes_on_and_what_is_finished_stays(capsys, scenes, tmp_path, monkeypatch):
-    scored, real = [], command._score_window
+    scored, real = [], module.score_window
 
-    def counted(sequence, window, *rest):
+    def counted(sequence, slot, *rest):
         if len(scored) == stop:
             raise KeyboardInterrupt
-        scored.append((sequence.name, window.number))
-        return real(sequence, window, *rest)
+        scored.append((sequence.name, slot.number))
+        return real(sequence, slot, *rest)
 
-    monkeypatch.setattr(command, "_score_window", counted)
+    monkeypatch.setattr(module, "score_window", counted)
     arguments = ["evaluate", "scenes:demo:0", "scenes:demo:1", "--methods", "repeat", "--output", tmp_path]
     arguments += ["--pictures", 0]
     stop = 4
@@ -228,8 +231,8 @@ def test_seeds_share_one_compilation(capsys, scenes, tmp_path, monkeypatch):
 
 
 def scores(psnr, *, ms=1.0, **causes):
-    by_cause = {c: {"psnr": p, "share": s} for c, (p, s) in causes.items()}
-    return {"psnr": psnr, "ssim": 0.5, "by_cause": by_cause, "ms": {"median": ms, "iqr": 0.1, "compile": 2.0}}
+    by_cause = {c: CauseScore(p, s) for c, (p, s) in causes.items()}
+    return MethodResult(psnr, {"ssim": 0.5}, RunTime(ms, 0.1, 2.0), by_cause)
 
 
 def test_means_over_inputs_are_on_equal_footing():
@@ -240,13 +243,13 @@ def test_means_over_inputs_are_on_equal_footing():
         {"a": scores(90.0)},  # b cannot run here
     ]
     mean = mean_over_inputs(inputs)
-    assert [mean[n]["psnr"] for n in "ab"] == [30.0, 40.0]
-    assert [mean[n]["inputs"] for n in "ab"] == [2, 2]
-    assert mean["a"]["by_cause"]["hole"] == {"psnr": 10.0, "share": pytest.approx(0.1)}
-    assert mean["a"]["ms"] == {"median": pytest.approx(2), "iqr": pytest.approx(0.1), "compile": 8.0}
-    assert mean_over_inputs([{"a": scores(math.inf)}])["a"]["psnr"] == math.inf
+    assert [mean[n].psnr for n in "ab"] == [30.0, 40.0]
+    assert [mean[n].inputs for n in "ab"] == [2, 2]
+    assert mean["a"].by_cause["hole"] == CauseScore(10.0, pytest.approx(0.1))
+    assert mean["a"].ms == RunTime(pytest.approx(2), pytest.approx(0.1), 8.0)
+    assert mean_over_inputs([{"a": scores(math.inf)}])["a"].psnr == math.inf
     apart = mean_over_inputs([{"a": scores(1.0)}, {"b": scores(2.0)}])
-    assert [apart[n]["psnr"] for n in "ab"] == [1.0, 2.0]
+    assert [apart[n].psnr for n in "ab"] == [1.0, 2.0]
 
 
 def test_unknown_and_missing_metrics(capsys, scenes, tmp_path, monkeypatch):
@@ -298,8 +301,8 @@ def test_metrics_by_name(capsys, scenes, tmp_path, monkeypatch):
     assert "ssim" not in repeat
     assert (repeat["vmaf"], warp["vmaf"]) == (81.0, 82.0)
     for k, (a, b) in enumerate(zip(*clips[0], strict=True)):
-        np.testing.assert_array_equal(a, shown[k][0])
-        np.testing.assert_array_equal(b, shown[k][1])
+        np.testing.assert_array_equal(a, eight_bit(shown[k][0]))
+        np.testing.assert_array_equal(b, eight_bit(shown[k][1]))
     page = (tmp_path / "report.html").read_text()
     assert f'<td class="top">{warp["flip"]:.4f}</td>' in page
     assert '<td class="top">82.00</td>' in page
@@ -322,9 +325,22 @@ def test_installed_metrics(capsys, scenes, tmp_path):
     assert repeat["vmaf"] < warp["vmaf"] <= 100
 
 
-def test_video_shows_rendered_and_made_frames_in_turn(scenes):
+def test_video_shows_rendered_and_generated_frames_in_turn(scenes, tmp_path, monkeypatch):
     sequence, method = Scene("demo"), jx.load("warp")
-    pictures = list(_shown(sequence, [3, 5], {"repeat": jx.load("repeat"), "warp": method}, 1, 0))
+    evaluation = Evaluation.prepare(sequence, {"repeat": jx.load("repeat"), "warp": method}, {}, frames=[3, 5])
+    gallery = Gallery(tmp_path, hdr=True)
+    evaluation.run(gallery=gallery, keep_all=True)
+    pictures, written = [], []
+    monkeypatch.setattr(video, "side_by_side", lambda row, labels: pictures.append((row, labels)))
+    monkeypatch.setattr(
+        video, "write_video", lambda path, frames, **options: written.append((len(list(frames)), options))
+    )
+    slots = [slot for slot in evaluation.slots if slot.number in (3, 5)]
+    labels = {"repeat": "a", "warp": "b"}
+    video.write_evaluation_video(tmp_path / "video.webp", sequence, slots, labels, gallery, fps=30)
+    assert written == [(4, {"count": 4, "fps": 30})]
+    assert all(labels == ["truth", "a", "b"] for _, labels in pictures)
+    pictures = [row for row, _ in pictures]
     assert [len(p) for p in pictures] == [3] * 4
 
     def codes(color):

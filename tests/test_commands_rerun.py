@@ -12,6 +12,7 @@ from synthetic import make_frame, make_keyframe
 
 import jaxtrapolate as jx
 import jaxtrapolate.commands.evaluate as command
+import jaxtrapolate.evaluation.evaluate as module
 from jaxtrapolate.commands.main import main
 from jaxtrapolate.evaluation.runnable import history_costs
 from jaxtrapolate.evaluation.windows import hide
@@ -143,18 +144,18 @@ def test_a_copied_input_is_the_same(capsys, still_dump, tmp_path, monkeypatch):
     assert run(capsys, "evaluate", still_dump, *arguments)[0] == 0
     copy = tmp_path / "copy"
     shutil.copytree(still_dump, copy, copy_function=shutil.copy)
-    monkeypatch.setattr(command, "_score_window", None)  # nothing is scored anew
+    monkeypatch.setattr(module, "score_window", None)  # nothing is scored anew
     assert run(capsys, "evaluate", copy, *arguments)[0] == 0
 
 
 def test_one_method_more_keeps_the_scores_of_the_others(capsys, still_dump, tmp_path, monkeypatch):
-    asked, real = [], command._score_window
+    asked, real = [], module.score_window
 
-    def counted(sequence, window, methods, *rest):
-        asked.append((window.number, *methods))
-        return real(sequence, window, methods, *rest)
+    def counted(sequence, slot, window, generated, *rest):
+        asked.append((slot.number, *generated))
+        return real(sequence, slot, window, generated, *rest)
 
-    monkeypatch.setattr(command, "_score_window", counted)
+    monkeypatch.setattr(module, "score_window", counted)
     common = ("evaluate", still_dump, "--pictures", 0, "--output", tmp_path, "--methods")
     assert run(capsys, *common, "repeat")[0] == 0
     assert run(capsys, *common, "repeat,warp")[0] == 0

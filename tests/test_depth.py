@@ -136,7 +136,7 @@ def operations():
         "interpolate_assisted": assisted,
         "overlay": over,
         "interpolate_bidirectional": bidirectional,
-        "interpolate_bidirectional_bilinear": lambda *a: bidirectional(*a, flow_filter="bilinear"),
+        "interpolate_bidirectional_bilinear": lambda *a: bidirectional(*a, search=jx.SearchOptions(filter="bilinear")),
     }
 
 

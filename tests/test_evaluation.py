@@ -10,6 +10,7 @@ import jaxtrapolate as jx
 from jaxtrapolate.evaluation.score import causes_of, mean_over_frames, score
 from jaxtrapolate.evaluation.stages import time_stages
 from jaxtrapolate.evaluation.windows import held_back, hide, windows
+from jaxtrapolate.results import CauseScore, FrameScore
 
 
 def test_every_second_frame_is_held_back():
@@ -131,9 +132,9 @@ def test_scores_by_cause_make_up_the_whole():
     causes = causes_of(sequence, w)
     image = jx.load("warp")(w.history, w.target)
     result = score(image, w, causes, None, hdr=True)
-    assert sum(c["share"] for c in result["by_cause"].values()) == pytest.approx(1)
-    whole = sum(c["share"] * 10 ** (-c["psnr"] / 10) for c in result["by_cause"].values())
-    assert -10 * np.log10(whole) == pytest.approx(result["psnr"], abs=1e-3)
+    assert sum(c.share for c in result.by_cause.values()) == pytest.approx(1)
+    whole = sum(c.share * 10 ** (-c.psnr / 10) for c in result.by_cause.values())
+    assert -10 * np.log10(whole) == pytest.approx(result.psnr, abs=1e-3)
 
 
 def test_pixels_that_were_not_finite_are_not_scored():
@@ -141,9 +142,9 @@ def test_pixels_that_were_not_finite_are_not_scored():
     wrong = np.array(w.truth.color)
     wrong[3, 4] += 1
     invalid = np.zeros((32, 48), bool)
-    assert score(jnp.asarray(wrong), w, None, invalid, hdr=True)["psnr"] < 60
+    assert score(jnp.asarray(wrong), w, None, invalid, hdr=True).psnr < 60
     invalid[3, 4] = True
-    assert score(jnp.asarray(wrong), w, None, invalid, hdr=True)["psnr"] == np.inf
+    assert score(jnp.asarray(wrong), w, None, invalid, hdr=True).psnr == np.inf
 
 
 def test_means_are_over_frames():
@@ -155,10 +156,13 @@ def test_means_are_over_frames():
         },
         {"psnr": 30.0, "ssim": 0.7, "by_cause": {"rest": {"psnr": 40.0, "share": 1.0}}},
     ]
-    mean = mean_over_frames(frames)
-    assert mean["psnr"] == 25
-    assert mean["by_cause"]["hole"] == {"psnr": 10.0, "share": 0.05}
-    assert mean["by_cause"]["rest"]["psnr"] == 35
+    entries = ({"number": i, "ms": 10.0 + i, **frame} for i, frame in enumerate(frames))
+    mean = mean_over_frames([FrameScore.from_json(entry) for entry in entries])
+    assert mean.psnr == 25
+    assert mean.by_cause["hole"] == CauseScore(10.0, 0.05)
+    assert mean.by_cause["rest"].psnr == 35
+    assert mean.ms.median == 10.5
+    assert mean.by_distance == {}
 
 
 def test_stage_times_cover_the_active_stages():

@@ -58,7 +58,7 @@ def test_default_weights_are_ahead_of_their_inputs(name):
         causes = causes_of(sequence, window)
         for m, method in methods.items():
             image = method(*arguments(method, window))
-            decibels[m].append(score(image, window, causes, None, hdr=True)["psnr"])
+            decibels[m].append(score(image, window, causes, None, hdr=True).psnr)
     mean = {m: np.mean(values) for m, values in decibels.items()}
     assert mean["extranet"] > mean["occlusion_warp"] + 1
     assert mean["extranet"] > mean["guided_warp"]
@@ -117,7 +117,7 @@ def test_weights_that_do_not_fit_are_refused(model, saved, tmp_path):
     refused("weights of method 'patchex', expected 'extranet'", method="patchex")
     refused(r"do not fit: decoder/0/layers/0/feature/bias is \[8\], expected \[9\]", network={"widths": [6, 6]})
     refused("missing merge/feature/bias", tree={k: v for k, v in given.tree.items() if k != "merge"})
-    refused("ExtraNetConfig has no depth", network={"depth": 4})
+    refused("ExtraNetConfig: depth: no such setting", network={"depth": 4})
     refused("Preparation: by: expected one of", preparation={"by": "colour"})
     path = tmp_path / "a.pth.tar"
     path.write_bytes(b"hello")

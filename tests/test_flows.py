@@ -150,7 +150,7 @@ def test_the_change_of_depth():
 def test_the_frame_between_from_backward_motion_alone():
     previous, next, _ = backward_only()
     made = jx.complete_flows(previous, next)
-    options = {"visibility": "round_trip"}
+    options = {"visibility": jx.VisibilityOptions(test="round_trip")}
     row = np.asarray(jx.interpolate_bidirectional(made.previous, made.next, 0.5, **options).color)[1, :, 0]
     np.testing.assert_allclose(row[7:15], 0.85, atol=1e-6)
     np.testing.assert_allclose(row[[0, 1, 2, 20, 23]], 0.15, atol=1e-6)

@@ -9,7 +9,6 @@ from oracles import random, random_motion
 
 import jaxtrapolate as jx
 from jaxtrapolate.evaluation.windows import hide
-from jaxtrapolate.methods.warping import guided
 from jaxtrapolate.ops.guided import far_motion
 from jaxtrapolate.records import Frame, GBuffer
 
@@ -112,7 +111,7 @@ def test_a_hole_wider_than_the_kernels_is_filled_from_the_wall():
     (source, truth), hole = wide_hole()
     error = {}
     for rows in (None, 8):
-        image = np.asarray(guided(rows=rows)((source,), hide(truth)))
+        image = np.asarray(jx.load("guided_warp", rows=rows)((source,), hide(truth)))
         apart = np.abs(image - truth.color)
         assert apart[~hole].max() < 0.05
         error[rows] = apart[hole].mean()

@@ -1,5 +1,7 @@
 """Methods: the four that warp, their stages, what they leave out, and what they say when something is missing."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -139,7 +141,7 @@ def test_the_pure_function_under_vmap():
     method = jx.load("guided_warp")
     windows = [window(t) for t in (4, 5)]
     batch = jax.tree.map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *[w[:2] for w in windows])
-    images = jax.jit(jax.vmap(lambda h, t: method.function((), (), h, t)[1]))(*batch)
+    images = jax.jit(jax.vmap(lambda h, t: method.function(method.state, (), h, t)[1]))(*batch)
     single = np.stack([method(h, t) for h, t, _ in windows])
     np.testing.assert_allclose(images, single, atol=2e-5)
 
@@ -150,7 +152,9 @@ def test_the_pure_function_under_grad():
     history, target, truth = window(4)
 
     def loss(motion):
-        return jnp.mean(jnp.square(method.function((), (), history, replace(target, motion=motion))[1] - truth))
+        return jnp.mean(
+            jnp.square(method.function(method.state, (), history, replace(target, motion=motion))[1] - truth)
+        )
 
     gradient = jax.jit(jax.grad(loss))(jnp.asarray(target.motion))
     assert np.isfinite(gradient).all()
@@ -165,7 +169,7 @@ def test_hindsight_keeps_fog_from_printing_a_texture(methods, name):
     with_hindsight = db(methods[name](history, target), truth)
     assert with_hindsight > plain - 0.05
     stages = tuple(s for s in methods[name].stages if s.name != "hindsight")
-    without = type(methods[name])(name, stages, past=2)
+    without = dataclasses.replace(methods[name], stages=stages)
     assert db(without(history, target), truth) < with_hindsight
 
 

@@ -14,13 +14,17 @@ import xml.etree.ElementTree
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
 from PIL import Image
 
 from jaxtrapolate import report
+from jaxtrapolate import results as results_module
 from jaxtrapolate.errors import InputError
 from jaxtrapolate.files import write_png
 from jaxtrapolate.ops.causes import CAUSES
-from jaxtrapolate.report import values
+from jaxtrapolate.report import plots, values
 from jaxtrapolate.report.pictures import Pictures
 
 HOSTILE = (
@@ -28,6 +32,10 @@ HOSTILE = (
     '"><img src=x onerror="document.documentElement.dataset.hacked=1">',
     "</style></script>--><b>$\\frac{",
     "_漢字 {{ 7*7 }} \x1b\ud800" + "long" * 30,
+)
+METHODS = (
+    *("repeat", "warp", "occlusion_warp", "guided_warp", "blend", "reproject", "half_motion", "warp_3d", "grid_warp"),
+    *("grid_extrapolate", "softmax_splat", "dis", "bidirectional_image", "bidirectional", "bidirectional_guided"),
 )
 VOID = {"meta", "img", "input", "br", "link"}
 
@@ -294,7 +302,7 @@ def test_infinite_decibels(tmp_path, infinite):
 
 
 def test_equal_images_without_decibels_have_infinitely_many():
-    equal, unknown = values.read_methods(
+    equal, unknown = values.named_methods(
         {"methods": {"a": {"psnr": None, "ssim": 1.0}, "b": {"psnr": None, "ssim": 0.9}}}
     )
     assert equal.psnr == math.inf
@@ -338,6 +346,47 @@ def test_plots_hold_each_method_and_leave_matplotlib_alone(tmp_path):
         assert all(f"<!-- {name} -->" in svg for name in results["methods"])
 
 
+def boxes_of(labels, figure):
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    figure.draw_without_rendering()
+    return [Text.get_window_extent(label, renderer) for label in labels]
+
+
+@pytest.mark.parametrize("count, spread", [(2, 0.0), (8, 0.0), (8, 0.02), (12, 0.1), (16, 1.0), (16, 0.3), (3, 0.001)])
+@pytest.mark.parametrize("seed", range(3))
+def test_labels_cover_neither_points_nor_each_other(count, spread, seed):
+    """Also of points on top of each other; then a leader says whose each is."""
+    random = np.random.default_rng(seed)
+    names = [*METHODS[: count - 1], "a name of twenty-six signs"]
+    found = {
+        n: {"psnr": 30 + 6 * spread * u, "ms": {"median": 10 * 30 ** (spread * v)}}
+        for n, u, v in zip(names, random.random(count), random.random(count), strict=True)
+    }
+    found |= {"far": {"psnr": 20.0, "ms": {"median": 0.5}}}
+    methods = values.named_methods({"methods": found})
+    figure, labels = plots._error_time(methods)
+    assert [label.get_text() for label in labels] == [*names, "far"]
+    boxes = boxes_of(labels, figure)
+    axes = figure.axes[0]
+    inner = axes.get_window_extent()
+    for i, box in enumerate(boxes):
+        assert inner.x0 - 1 <= box.x0 < box.x1 <= inner.x1 + 1
+        assert inner.y0 - 1 <= box.y0 < box.y1 <= inner.y1 + 1
+        assert not any(box.overlaps(other) for other in boxes[i + 1 :])
+        for method in methods:
+            x, y = axes.transData.transform((method.ms.median, method.psnr))
+            assert not box.overlaps(Bbox.from_bounds(x - 4, y - 4, 8, 8))
+
+
+@pytest.mark.parametrize("count", [22, 40])
+def test_a_legend_where_there_is_no_place_for_labels(count):
+    found = {f"a method of a long name {i}": {"psnr": 30.0, "ms": {"median": 1.0}} for i in range(count)}
+    figure, labels = plots._error_time(values.named_methods({"methods": found}))
+    assert labels == []
+    assert len(figure.legends[0].get_texts()) == count
+    check_svg(report.plot_error_time({"methods": found}))
+
+
 def test_pareto_front():
     from jaxtrapolate.report.plots import _pareto
 
@@ -346,12 +395,12 @@ def test_pareto_front():
 
 
 def test_many_methods_are_told_apart():
-    methods = values.read_methods({"methods": {f"m{i}": {} for i in range(40)}})
+    methods = values.named_methods({"methods": {f"m{i}": {} for i in range(40)}})
     assert len({(m.color, m.marker) for m in methods}) == 40
 
 
 def test_best_and_reference():
-    methods = values.read_methods({"methods": {"warp": entry(30.0, 5), "b": entry(30.0, 2), "repeat": entry(9.0, 1)}})
+    methods = values.named_methods({"methods": {"warp": entry(30.0, 5), "b": entry(30.0, 2), "repeat": entry(9.0, 1)}})
     assert values.best_method(methods).name == "b"
     assert values.reference_method(methods).name == "warp"
     assert values.headline(methods[:1]) == "warp: 30.0 dB at 5.00 ms"
@@ -363,7 +412,7 @@ def test_best_and_reference():
     [(1, 1.0), ("2.5", 2.5), ("inf", math.inf), ("-Infinity", -math.inf), (math.nan, None), (True, None), ([], None)],
 )
 def test_number(value, expected):
-    assert values.number(value) == expected
+    assert results_module.number(value) == expected
 
 
 def test_texts():

@@ -46,10 +46,10 @@ def test_a_run_is_compiled_once():
     import jax._src.test_util as jtu
 
     previous, next, _ = three()
-    jx.interpolate_run(previous, next, factor=3, starts=["default"])
+    jx.interpolate_run(previous, next, factor=3, search=jx.SearchOptions(starts=["default"]))
     with jtu.count_jit_and_pmap_lowerings() as count:
-        jx.interpolate_run(previous, next, factor=3, starts=("default",))
-        jx.interpolate_run(next, previous, factor=3, starts=["default"])
+        jx.interpolate_run(previous, next, factor=3, search=jx.SearchOptions(starts=("default",)))
+        jx.interpolate_run(next, previous, factor=3, search=jx.SearchOptions(starts=["default"]))
     assert count() == 0
 
 
@@ -82,7 +82,7 @@ def test_light_that_changes_between_rendered_frames():
     size, steps, times = (48, 61), 4, np.float32([0.25, 0.5, 0.75])
     previous, next, _ = with_attributes(size, steps)
     lights = np.float32(brightness(times))
-    lit = jx.interpolate_run(previous, next, factor=4, shade=shade, lights=jnp.asarray(lights))
+    lit = jx.interpolate_run(previous, next, factor=4, shade_attributes=shade, lights=jnp.asarray(lights))
     colors = [jx.replace(f, color=shade(f.color, jnp.float32(1))) for f in (previous, next)]
     blended = jx.interpolate_run(*colors, factor=4)
     for k, time in enumerate(times):
@@ -95,9 +95,9 @@ def test_other_lights_compile_nothing():
 
     previous, next, _ = with_attributes((48, 61))
     lights, others = jnp.float32([1, 2, 3]), jnp.float32([2, 4, 6])
-    first = jx.interpolate_run(previous, next, factor=4, shade=shade, lights=lights)
+    first = jx.interpolate_run(previous, next, factor=4, shade_attributes=shade, lights=lights)
     with jtu.count_jit_and_pmap_lowerings() as count:
-        second = jx.interpolate_run(previous, next, factor=4, shade=shade, lights=others)
+        second = jx.interpolate_run(previous, next, factor=4, shade_attributes=shade, lights=others)
     assert count() == 0
     np.testing.assert_allclose(second, 2 * first, rtol=1e-6)
 
@@ -126,7 +126,9 @@ def test_whole_pixels_and_attributes():
     def shade(attributes, light):
         return attributes[..., :2] * attributes[..., 2:] * light
 
-    blurred = np.asarray(jx.motion_blur(*frames, shutter=0.75, samples=1, shade=shade, lights=jnp.asarray(lights)))
+    blurred = np.asarray(
+        jx.motion_blur(*frames, shutter=0.75, samples=1, shade_attributes=shade, lights=jnp.asarray(lights))
+    )
     colors = [np.float64(frame.color) for frame in frames]
     before = 0.25 * oracles.shift(colors[0], -6, 3, np.nan) + 0.75 * oracles.shift(colors[1], 2, -1, np.nan)
     after = 0.75 * oracles.shift(colors[1], -2, 1, np.nan) + 0.25 * oracles.shift(colors[2], 6, -3, np.nan)
@@ -187,7 +189,8 @@ def test_gradients_against_differences(x64):
     def total(first, second, third, flow, shutter):
         previous = keyframe(first, 2 * depth, forward=0.98 * flow)  # farther: the rendered frame's point counts
         current, next = keyframe(second, depth, flow, -flow), keyframe(third, 2 * depth, backward=-0.98 * flow)
-        options = {"starts": ("default",), "iterations": 40, "flow_filter": "bilinear", "visibility": "round_trip"}
+        search = jx.SearchOptions(starts=("default",), iterations=40, filter="bilinear")
+        options = {"search": search, "visibility": jx.VisibilityOptions(test="round_trip")}
         return jnp.sum(cotangent * jx.motion_blur(previous, current, next, shutter=shutter, samples=2, **options))
 
     given = (*colors, flow, np.float64(0.9))
@@ -267,9 +270,13 @@ def test_against_an_embedded_scene(name, shutter, least):
         ({"target": None}, ValueError, "target: expected none"),
         ({"next": None}, TypeError, "next: expected a Keyframe, got NoneType"),
         ({"previous": jx.Keyframe(color=jnp.ones((2, 3, 1)))}, ValueError, r"previous.color: expected shape \[6, 13,"),
-        ({"choice": "best"}, ValueError, "choice: expected one of"),
-        ({"lights": jnp.ones(11)}, ValueError, "lights: expected none without shade"),
-        ({"lights": jnp.ones(10), "shade": shade}, ValueError, r"lights: expected arrays \[11, ...\], got \[10\]"),
+        ({"search": jx.SearchOptions(choice="best")}, ValueError, "choice: expected one of"),
+        ({"lights": jnp.ones(11)}, ValueError, "lights: expected none without shade_attributes"),
+        (
+            {"lights": jnp.ones(10), "shade_attributes": shade},
+            ValueError,
+            r"lights: expected arrays \[11, ...\], got \[10\]",
+        ),
     ],
 )
 def test_errors(unchecked, options, error, message):

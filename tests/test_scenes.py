@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxtrapolate as jx
 from jaxtrapolate.records import check_frame
 from jaxtrapolate.scenes import flow, keyframe, render, visible
 from jaxtrapolate.scenes.scene import Builder, Scene, frame_along, material, path, turn, yaw
@@ -198,6 +199,19 @@ def test_motion_of_dynamic_surfaces_is_that_of_their_bodies(scene, frame, before
         off = np.abs(there - grid() - frame.motion).max(axis=-1)
         error = np.where(frame.gbuffer.stencil[..., 0] == stencil, np.minimum(error, off), error)
     assert error[frame.gbuffer.stencil[..., 0] > 0].max() < 0.02
+
+
+def test_object_matrices_lead_to_the_frame_before(frame, before):
+    """The motion of rigid objects is that of their positions, moved by the matrix of their id."""
+    matrices = np.concatenate([np.eye(4, dtype=np.float32)[None], np.asarray(frame.objects)])
+    buffers = frame.gbuffer
+    motion = jx.camera_motion(
+        buffers.position, frame.camera, before.camera, object_motion=jnp.asarray(matrices), stencil=buffers.stencil
+    )
+    rigid = (np.asarray(buffers.stencil) > 0)[..., 0] & np.isfinite(motion).all(-1)
+    assert rigid.sum() > 20
+    error = np.abs(np.asarray(motion) - np.asarray(frame.motion)).max(-1)
+    assert np.median(error[rigid]) < 1e-2
 
 
 def test_motion_warps_the_frame_before_onto_this_one(scene, frame, before):

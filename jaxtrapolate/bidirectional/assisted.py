@@ -1,31 +1,31 @@
 """Scene-assisted interpolation (Yang et al. 2011, section 4), and what it shares with the image-based one.
 
-The geometry of the frame to be made is drawn without shading: its depth, and where its points are in the two rendered
-frames around it. Colours come from there, where a depth test finds the point visible.
+The geometry of the frame to be generated is drawn without shading: its depth, and where its points are in the two
+rendered frames around it. Colours come from there, where a depth test finds the point visible.
 """
 
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Literal, get_args
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrapolate.bidirectional.search import Correspondence, check_scalar, positions, within
+from jaxtrapolate.bidirectional.search import Correspondence, check_scalar, fetch_finite, positions, within
 from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image, check_present
 from jaxtrapolate.ops.depth import held, released, surface_depth
 from jaxtrapolate.ops.strips import by_strips, once, rows_of
-from jaxtrapolate.ops.warp import Filter, all_finite, sample, weigh, where_finite
+from jaxtrapolate.ops.warp import Filter, all_finite, weigh
 from jaxtrapolate.precision import widest
+from jaxtrapolate.records import DepthKind as DepthKind
 from jaxtrapolate.records import Keyframe, record, replace
 
 Shader = Callable[[Array], Array]
-DepthKind = Literal["metric", "ordinal"]
 
 CASES = ("agree", "nearer", "one", "neither", "assisted", "missed", "rendered")
-"""How a pixel was made; `Interpolation.case` gives indices into this.
+"""How a pixel was generated; `Interpolation.case` gives indices into this.
 
 Image-based (5.2): both searches hit the same point; both hit, and the nearer point was taken; one hit; neither did.
 Scene-assisted (4): the point is visible in at least one of the frames around; in neither. "rendered": drawn anew (6).
@@ -54,9 +54,9 @@ class Interpolation:
     """An interpolated frame and how it came about.
 
     color `[H, W, C]`. weight `[H, W, 1]`: that of the next frame's colour: alpha where both are blended, 0 or 1 where
-    one was taken alone. case `[H, W]`: index into `CASES`. forward, backward: the point's place in the frame before and
-    after, as searched or as given by the scene. depth `[H, W, 1]`: in the frame made; `None` without depth. offsets:
-    for the next frame's searches.
+    one was taken alone. case `[H, W]`: index into `CASES`. forward, backward: the point's position in the frame before
+    and after, as searched or as given by the scene. depth `[H, W, 1]`: in the interpolated frame; `None` without depth.
+    offsets: for the next frame's searches.
     """
 
     color: Float[Array, "h w c"]
@@ -66,20 +66,6 @@ class Interpolation:
     backward: Correspondence
     depth: Float[Array, "h w 1"] | None = None
     offsets: Offsets | None = None
-
-
-def fetch_finite(
-    image: Float[Array, "h w c"], at: Float[Array, "i j 2"], filter: Filter, finite: Array | None = None
-) -> Float[Array, "i j c"]:
-    """The image at finite positions; a pixel that is not finite does not spread to where it has no weight.
-
-    finite: what `all_finite` says of the image, where that is known.
-    """
-
-    def look(product, image, at):
-        return sample(image, at[..., 0], at[..., 1], filter=filter, product=product)
-
-    return look(None, image, at) if filter == "nearest" else where_finite(look, image, at, finite)
 
 
 def blend(
@@ -181,24 +167,27 @@ def interpolate_assisted(
     *,
     epsilon_depth: float | Float[ArrayLike, ""] = 0.05,
     filter: Filter = "bilinear",
-    shader: Shader | None = None,
-    shade: Shader | None = None,
+    shade_on_miss: Shader | None = None,
+    shade_attributes: Shader | None = None,
 ) -> Interpolation:
     """The frame at t + alpha from its geometry, and the colours of the rendered frames before and after it.
 
     Each point is looked up in both frames, and counts as visible where it lands inside and the depth there agrees with
-    its own: visible in both, the colours are blended by alpha; in one, that colour is taken; in neither, what `shader`
-    says (shade-on-miss) or the nearer of the two (closest-on-miss).
+    its own: visible in both, the colours are blended by alpha; in one, that colour is taken; in neither, what
+    `shade_on_miss` says, or the nearer of the two (closest-on-miss).
 
     Args:
-        previous, next: with color `[H, W, C]`, any attributes, and depth.
-        target: of the frame to be made: depth, backward_flow to `previous`, forward_flow to `next`, exact; see
+        previous: with color `[H, W, C]`, any attributes, and depth.
+        next: the frame after it, likewise.
+        target: of the frame to be generated: depth, backward_flow to `previous`, forward_flow to `next`, exact; see
             `camera_flow`. Its color is not looked at.
         alpha: in 0..1, traced.
         epsilon_depth: how far depths of one point may differ, relative to the smaller.
         filter: of the colours, as in `backward_warp`.
-        shader: called with the mask `[H, W]` of the pixels visible in neither frame, gives their colour `[H, W, C']`.
-        shade: called with the blended attributes, gives the colour `[H, W, C']`; it may close over what changes.
+        shade_on_miss: called with the mask `[H, W]` of the pixels visible in neither frame, gives their colour
+            `[H, W, C']`.
+        shade_attributes: called with the blended attributes, gives the colour `[H, W, C']`; it may close over what
+            changes.
 
     Returns:
         An `Interpolation` without offsets.
@@ -230,13 +219,13 @@ def interpolate_assisted(
     check_choice("filter", filter, get_args(Filter))
     previous, next = (Keyframe(color=f.color, depth=f.depth) for f in (previous, next))
     target = replace(target, color=None, stencil=None, time=None)
-    made = _assisted(previous, next, target, alpha, epsilon_depth, filter=filter)
+    result = _assisted(previous, next, target, alpha, epsilon_depth, filter=filter)
     # not compiled with the rest: what they close over may change from frame to frame
-    color = made.color if shade is None else shade(made.color)
-    if shader is not None:
-        missed = made.case == CASES.index("missed")
-        color = jnp.where(missed[..., None], shader(missed).astype(color.dtype), color)
-    return replace(made, color=color)
+    color = result.color if shade_attributes is None else shade_attributes(result.color)
+    if shade_on_miss is not None:
+        missed = result.case == CASES.index("missed")
+        color = jnp.where(missed[..., None], shade_on_miss(missed).astype(color.dtype), color)
+    return replace(result, color=color)
 
 
 def drawn_over(below: Interpolation, above: Interpolation, covered: Array, epsilon: Array) -> Interpolation:
@@ -269,8 +258,10 @@ def overlay(
     """Pixels that were rendered anew, drawn over an interpolated frame through one depth buffer (Figure 4).
 
     Args:
-        below: the interpolated frame, as a rule made of I-frames that leave out what is drawn now.
-        color: `[H, W, C]`. depth: `[H, W, 1]`. covered: `[H, W]`, where something was rendered.
+        below: the interpolated frame, as a rule from I-frames that leave out what is drawn now.
+        color: `[H, W, C]`.
+        depth: `[H, W, 1]`.
+        covered: `[H, W]`, where something was rendered.
         epsilon_depth: by how much, relative to the smaller depth, it may lie behind and still be drawn.
 
     Returns:

@@ -13,16 +13,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxtrapolate.bidirectional.assisted import DepthKind
 from jaxtrapolate.bidirectional.search import check_flow, positions, within
 from jaxtrapolate.checks import Size, check_choice, check_image
 from jaxtrapolate.ops.depth import apart as depth_apart
 from jaxtrapolate.ops.depth import changed, held, surfaces_of
-from jaxtrapolate.ops.motion import camera_motion
+from jaxtrapolate.ops.fill import covered_around
+from jaxtrapolate.ops.motion import camera_motion, carried
 from jaxtrapolate.ops.scatter import splat_source
-from jaxtrapolate.ops.warp import sample, take_rows
-from jaxtrapolate.precision import widest
-from jaxtrapolate.records import Camera, Keyframe, replace
+from jaxtrapolate.ops.warp import root, sample, take_rows
+from jaxtrapolate.precision import divide, widest
+from jaxtrapolate.records import Camera, DepthKind, Keyframe, replace
 
 _HIDDEN = 0.2  # relative: a surface whose depth changes by more is taken for another one
 
@@ -34,10 +34,8 @@ def _view_depth(camera: Camera, points: Array) -> Array:
     """
     view, projection = cast(Array, camera.view), cast(Array, camera.projection)
     seen = points @ view.T
-    square = jnp.sum(jnp.square(projection[3, :3]))
-    perspective = square > 0
     along = (seen[..., :3] @ projection[3, :3])[..., None]
-    return jnp.where(perspective, along / jnp.sqrt(jnp.where(perspective, square, 1)), -seen[..., 2:3])
+    return divide(along, root(jnp.sum(jnp.square(projection[3, :3]))), otherwise=-seen[..., 2:3])
 
 
 @jax.jit
@@ -53,7 +51,8 @@ def camera_flow(
 
     Args:
         position: `[H, W, 3]`, world space.
-        camera, other_camera: of this frame and of the one that the flow leads to, before or after it.
+        camera: of this frame.
+        other_camera: of the frame that the flow leads to, before or after this one.
         object_motion: `[N, 4, 4]`: for each stencil id 0..N-1 the matrix from world positions in this frame to world
             positions in the other.
         stencil: `[H, W, 1]` ids that pick the matrix; ids beyond N-1 count as static. Needed with `object_motion`.
@@ -78,15 +77,7 @@ def camera_flow(
     """
     motion = camera_motion(position, camera, other_camera, object_motion=object_motion, stencil=stencil)
     finite = jnp.all(jnp.isfinite(motion), -1, keepdims=True)
-    points = jnp.where(finite, position, 0)
-    points = jnp.concatenate([points, jnp.ones_like(points[..., :1])], -1)
-    moved = points
-    if object_motion is not None and stencil is not None:
-        ids = jnp.round(stencil).astype(jnp.int32)
-        known = (ids >= 0) & (ids < object_motion.shape[0])
-        rows = take_rows(object_motion.reshape(-1, 16), jnp.where(known, ids, 0)[..., 0])
-        carried = jnp.sum(rows.reshape(*rows.shape[:2], 4, 4) * points[..., None, :], -1)
-        moved = jnp.where(known, carried, points)
+    points, moved = carried(jnp.where(finite, position, 0), object_motion, stencil)
     change = _view_depth(other_camera, moved) - _view_depth(camera, points)
     return jnp.concatenate([motion, jnp.where(finite, change, jnp.nan)], -1)
 
@@ -111,36 +102,21 @@ class CompletedFlows:
     derived: tuple[str, ...]
 
 
-def _last(mask, *, axis, reverse):
-    """The index along an axis of the last pixel in the mask up to each pixel; -1 where there is none."""
-    index = jax.lax.broadcasted_iota(jnp.int32, mask.shape, axis)
-    if reverse:
-        count = mask.shape[axis]
-        found = jax.lax.cummin(jnp.where(mask, index, count), axis=axis, reverse=True)
-        return jnp.where(found < count, found, -1)
-    return jax.lax.cummax(jnp.where(mask, index, -1), axis=axis)
-
-
 def _fill(flow, covered, depth):
     """Uncovered pixels take the flow of one of the next covered ones left, right, above, below: that most like them.
 
     Like: the smallest difference of depth; at equal differences, or without depth, the closest; then in that order.
     """
     height, width, _ = flow.shape
-    row, column = (jax.lax.broadcasted_iota(jnp.int32, covered.shape, k) for k in (0, 1))
     rows = flow.reshape(-1, flow.shape[-1])
     best, apart = jnp.zeros_like(flow), jnp.full(covered.shape, jnp.inf, jnp.float32)
     steps = jnp.full(covered.shape, height + width, jnp.int32)
-    for axis, reverse in ((1, False), (1, True), (0, False), (0, True)):
-        found = _last(covered, axis=axis, reverse=reverse)
-        there = jnp.maximum(found, 0)
-        index = row * width + there if axis == 1 else there * width + column
-        far = jnp.abs(found - (column if axis == 1 else row))
+    for found, index, far in covered_around(covered):
         differs = jnp.zeros(covered.shape, jnp.float32)
         if depth is not None:
             differs = depth_apart(take_rows(depth.reshape(-1, 1), index), depth)[..., 0].astype(jnp.float32)
             differs = jnp.where(jnp.isnan(differs), jnp.float32(jnp.finfo(jnp.float32).max), differs)
-        better = (found >= 0) & ((differs < apart) | ((differs == apart) & (far < steps)))
+        better = found & ((differs < apart) | ((differs == apart) & (far < steps)))
         best = jnp.where(better[..., None], take_rows(rows, index), best)
         apart, steps = jnp.where(better, differs, apart), jnp.where(better, far, steps)
     return jnp.where(covered[..., None], flow, best)
@@ -181,7 +157,7 @@ def _deepened(flow, depth, other_depth):
 
 @partial(jax.jit, static_argnames=("depth",))
 def complete_flows(previous: Keyframe, next: Keyframe, *, depth: DepthKind = "metric") -> CompletedFlows:
-    """Two keyframes with both flows between them, those that the input lacks made from the other.
+    """Two keyframes with both flows between them, those that the input lacks derived from the other.
 
     A missing flow is the other one turned around: -flow, splatted along it (`splat_nearest`, depth-tested where there
     is depth). Where nothing lands (points that are hidden or outside in the other frame), or, with metric depth, where
@@ -191,13 +167,13 @@ def complete_flows(previous: Keyframe, next: Keyframe, *, depth: DepthKind = "me
     outside, or is more than 20 %: another surface.
 
     Args:
-        previous, next: of which forward_flow and backward_flow count, the flows between the two, `[H, W, 3]` or,
-            without the change of depth, `[H, W, 2]`; at least one; and depth `[H, W, 1]`, which may be absent; what is
-            not positive is nothing, and far.
+        previous: forward_flow to `next`, `[H, W, 3]` or, without the change of depth, `[H, W, 2]`; and depth
+            `[H, W, 1]`, which may be absent; what is not positive is nothing, and far.
+        next: likewise, with backward_flow to `previous`. At least one of the two flows is needed.
         depth: "metric" (distance along the view axis), or "ordinal" (only its order counts).
 
     Returns:
-        `CompletedFlows`. What was given is kept as it is, but nothing has depth +inf. Flow vectors of a splat are of
+        `CompletedFlows`. What was given is kept unchanged, but nothing has depth +inf. Flow vectors of a splat are of
         the dtype of the given flow.
 
     Convention:

@@ -1,298 +1,29 @@
-"""Image-based bidirectional reprojection (Yang et al. 2011, sections 5 and 6).
-
-A frame between two rendered ones, the I-frames at t and t + 1, is made from their colours, depths and 3D flows alone:
-each of its pixels searches for its point in both, the visible one is chosen and, where the other I-frame shows it as
-well, the two colours are blended.
-"""
+"""Bidirectional reprojection (Yang et al. 2011): image-based, scene-assisted, or both in one frame (section 6)."""
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal, NamedTuple, cast, get_args
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxtrapolate.bidirectional.assisted import (
     CASES,
-    DepthKind,
     Interpolation,
     Offsets,
     Shader,
-    agree,
-    blend,
     check_keyframe,
     drawn_over,
-    fetch_finite,
     interpolate_assisted,
-    shown,
 )
-from jaxtrapolate.bidirectional.search import (
-    Correspondence,
-    FlowFilter,
-    Leads,
-    Solver,
-    advance,
-    check_flow,
-    check_scalar,
-    check_search,
-    leads,
-    missed,
-    missed_by,
-    plane,
-    positions,
-    solve,
-    within,
-)
-from jaxtrapolate.bidirectional.starts import LatestOffsets, dual, latest
+from jaxtrapolate.bidirectional.image_based import SEARCH, VISIBILITY, interpolate_image_based
+from jaxtrapolate.bidirectional.options import SearchOptions, VisibilityOptions
 from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image, check_present
-from jaxtrapolate.ops.depth import held, released, surface_depth
-from jaxtrapolate.ops.strips import by_strips, once
-from jaxtrapolate.ops.warp import Filter, all_finite, inside, sample
-from jaxtrapolate.precision import widest
+from jaxtrapolate.ops.warp import Filter
 from jaxtrapolate.records import Keyframe, replace
 
-Start = Literal["default", "dual", "latest"]
-Choice = Literal["error", "depth"]
-Visibility = Literal["auto", "depth", "round_trip", "inside"]
 TargetMode = Literal["reproject", "render"]
-
-_EQUAL = 1e-3  # pixels: errors that differ by less do so by rounding
-
-
-class _Found(NamedTuple):
-    """One solution of a search `[rows, W, ...]`: place, whole flow, error, depth in the frame to be made, hit."""
-
-    at: Array
-    flow: Array
-    error: Array
-    depth: Array
-    hit: Array
-
-
-class _Options(NamedTuple):
-    """What is static."""
-
-    starts: tuple[Start, ...]
-    iterations: int
-    solver: Solver
-    flow_filter: FlowFilter
-    filter: Filter
-    choice: Choice
-    depth: Literal["metric", "ordinal", "absent"]
-    visibility: Literal["depth", "round_trip", "inside"]
-    reach: int
-
-
-class _Side(NamedTuple):
-    """What there is of one I-frame, all rows.
-
-    depth: `held`, so that nothing is at 1e30. passed: the depth `[H, W]` of its points in the frame to be made. leads:
-    of its flow toward the other I-frame. finite: whether the colours and the depths are. latest: what the frame made
-    last leaves.
-    """
-
-    color: Array
-    depth: Array | None
-    passed: Array | None
-    leads: Leads
-    finite: tuple[Array, Array | None]
-    latest: LatestOffsets | None
-
-    @property
-    def flow(self) -> Array:
-        return self.leads.flow
-
-    @property
-    def fraction(self) -> Array:
-        return self.leads.fraction
-
-    @property
-    def size(self) -> Size:
-        """`(H, W)`."""
-        return self.flow.shape[0], self.flow.shape[1]
-
-
-def _starts(side: _Side, other: _Side, top, rows: int, options: _Options) -> list[Array | None]:
-    """Positions to start from (5.3), complex planes, `None` for the pixels themselves."""
-    places: list[Array | None] = []
-    for name in options.starts:
-        if name == "default":
-            places.append(None)
-        elif name == "dual":
-            places.append(dual(other.flow, side.fraction, top, rows))
-        elif side.latest is not None:
-            places.append(latest(side.latest, top, rows, reach=options.reach))
-    return places or [None]
-
-
-def _best(sources, top, rows: int, *, options: _Options) -> Array:
-    """Where the best solution of all starts is in one I-frame, a complex plane.
-
-    The smaller error (5.3), inside the frame first; or the nearer, if both hit.
-    """
-    side, other, epsilon = sources
-    starts = _starts(side, other, top, rows, options)
-
-    def found(start):
-        return advance(side.leads, start, top, rows, options.iterations, options.solver, options.flow_filter)
-
-    if len(starts) == 1:
-        return found(starts[0])
-
-    def step(best, given):
-        at = found(given[1])
-        error = missed(side.leads, at, top, options.flow_filter)
-        depth = jnp.zeros_like(error)
-        if side.passed is not None and options.choice == "depth":
-            depth = sample(side.passed[..., None], at.real, at.imag, filter=options.flow_filter)[..., 0]
-        best_at, best_error, best_depth = best
-        closer = error < best_error - _EQUAL
-        inner, best_inner = (inside(place.real, place.imag, *side.size) for place in (at, best_at))
-        if options.choice == "depth":
-            hits = inner & (error < epsilon), best_inner & (best_error < epsilon)
-            closer = jnp.where(hits[0] & hits[1], depth < best_depth, closer)
-        better = given[0] | jnp.where(inner == best_inner, closer, inner)
-        return tuple(jnp.where(better, a, b) for a, b in zip((at, error, depth), best, strict=True)), None
-
-    grid = plane(positions(rows, side.size[1], side.flow.dtype, top=top))
-    starts = jnp.stack([grid if start is None else start for start in starts])
-    none = jnp.zeros(grid.shape, side.flow.dtype)
-    # a loop, because XLA on a CPU would make every solution anew for each that is compared with it
-    return jax.lax.scan(step, (grid, none, none), (jnp.arange(len(starts)) == 0, starts))[0][0]
-
-
-def _find(side: _Side, other: _Side, epsilon, top, rows: int, options: _Options) -> _Found:
-    """The best solution of all starts in one I-frame."""
-    sources = jax.lax.stop_gradient((side, other, epsilon))
-    best = partial(_best, options=options)
-    at = by_strips(best, rows, sources) if rows == side.size[0] else best(sources, top, rows)
-    at, value = solve(side.leads, at, top, rows, 0, options.solver, options.flow_filter)
-    value, error = missed_by(at, value, side.fraction, positions(rows, side.size[1], side.flow.dtype, top=top))
-    hit = (error < epsilon) & within(at, *side.size)[..., None]
-    depth = jnp.zeros_like(error)
-    if side.depth is not None:
-        # from the same pixels as the flow, whose change of depth is theirs
-        depth = sample(side.depth, at[..., 0], at[..., 1], filter=options.flow_filter).astype(at.dtype)
-    if options.depth == "metric" and side.flow.shape[2] == 3:
-        depth = depth + side.fraction * value[..., 2:]  # eq. 6 and 11
-    return _Found(at, value, error, jnp.where(jnp.isnan(depth), jnp.inf, depth), hit)
-
-
-def _visible_in(other: _Side, found: _Found, epsilon_depth, epsilon_trip, options: _Options):
-    """Whether a point found in one I-frame is seen in the other (5.2): its place there, and the answer `[H, W, 1]`."""
-    there = found.at + found.flow[..., :2]
-    seen = within(there, *other.size)[..., None] & (found.error < jnp.inf)
-    if options.visibility == "depth":
-        expected = found.depth + other.fraction * found.flow[..., 2:]  # the rest of the way
-        seen &= shown(cast(Array, other.depth), there, expected, epsilon_depth, other.finite[1])
-    elif options.visibility == "round_trip":
-        back = sample(other.flow, there[..., 0], there[..., 1], filter=options.flow_filter).astype(there.dtype)
-        apart = found.flow[..., :2] + back[..., :2]
-        seen &= jnp.sum(jnp.square(apart), -1, keepdims=True) < jnp.square(epsilon_trip)
-    return there, seen
-
-
-def _ratio(now, then):
-    """now / then, 0 where then is 0: the offsets of that frame are 0 as well."""
-    return jnp.where(then > 0, now / jnp.where(then > 0, then, 1), 0)
-
-
-def _part(sources, top, rows: int, *, options: _Options) -> tuple[Interpolation, tuple[Array | None, ...]]:
-    """Some rows of the frame, before shading and without its offsets; and those but for alpha."""
-    previous, next, epsilon_error, epsilon_depth, epsilon_trip = sources
-    alpha, size = previous.fraction, previous.size
-    f = _find(previous, next, epsilon_error, top, rows, options)
-    b = _find(next, previous, epsilon_error, top, rows, options)
-
-    # 5.2: which of the two points is the one to be seen
-    same = jnp.ones_like(f.hit)
-    if options.depth != "absent":
-        same = agree(f.depth, b.depth, epsilon_depth, options.depth)
-    f_inside, b_inside = (within(a.at, *size)[..., None] for a in (f, b))
-    apart = f.error - b.error
-    smaller = jnp.where(jnp.abs(apart) < _EQUAL, alpha < 0.5, apart < 0)
-    smaller = jnp.where(f_inside == b_inside, smaller, f_inside)
-    by_error = jnp.where(f.hit == b.hit, smaller, f.hit)
-    take_f = jnp.where(f.hit & b.hit & ~same, f.depth < b.depth, by_error)
-    take_f = once(jnp.where(alpha == 0, True, jnp.where(alpha == 1, False, take_f)))
-    case = jnp.where(same, CASES.index("agree"), CASES.index("nearer"))
-    case = jnp.where(f.hit & b.hit, case, jnp.where(f.hit | b.hit, CASES.index("one"), CASES.index("neither")))
-
-    # eq. 14 and 15: that point in both I-frames, blended where both show it
-    f_there, f_seen = _visible_in(next, f, epsilon_depth, epsilon_trip, options)
-    b_there, b_seen = _visible_in(previous, b, epsilon_depth, epsilon_trip, options)
-    first, second = jnp.where(take_f, f.at, b_there), jnp.where(take_f, f_there, b.at)
-    both = once(jnp.where(take_f, f_seen, b_seen))
-    weight = jnp.where(both, alpha, jnp.where(take_f, 0, 1).astype(alpha.dtype))
-    first_color, second_color = (
-        fetch_finite(side.color, at, options.filter, side.finite[0]) for side, at in ((previous, first), (next, second))
-    )
-    color = blend(first_color, second_color, weight)
-
-    grid = positions(rows, size[1], alpha.dtype, top=top)
-    known = options.depth != "absent"
-    left = [grid - a.at for a in (f, b)] + [jnp.where(a.hit, a.depth, jnp.inf) if known else None for a in (f, b)]
-    forward, backward = (
-        Correspondence(a.at, side.fraction * a.flow[..., 2:] if side.flow.shape[2] == 3 else None, a.error)
-        for a, side in ((f, previous), (b, next))
-    )
-    depth = released(jnp.where(take_f, f.depth, b.depth)) if known else None
-    return Interpolation(color, weight, case[..., 0].astype(jnp.int32), forward, backward, depth), tuple(left)
-
-
-@partial(jax.jit, static_argnames=("options",))
-def _interpolate(previous, next, alpha, offsets, epsilon_error, epsilon_depth, epsilon_trip, *, options):
-    flow, opposite = previous.forward_flow, next.backward_flow
-    wide = widest(flow, opposite)
-    numbers = (alpha, epsilon_error, epsilon_depth, epsilon_trip)
-    alpha, *epsilons = (jnp.asarray(a).astype(wide) for a in numbers)
-
-    def side(frame, flow, fraction, offset, last_depth, last):
-        flow, known = flow.astype(wide), None
-        if offset is not None:
-            known = LatestOffsets(offset.astype(wide), last_depth, _ratio(fraction, last))
-        depth, passed = None, None
-        if options.depth != "absent":
-            depth = held(surface_depth(jnp.asarray(frame.depth)))
-            passed = depth[..., 0].astype(wide)
-            if options.depth == "metric" and flow.shape[2] == 3:
-                change = flow[..., 2]
-                passed = passed + fraction * jnp.where(jnp.isfinite(change), change, 0)
-            passed = jnp.where(jnp.isnan(passed), jnp.inf, passed)
-        finite = all_finite(frame.color), None if depth is None else all_finite(depth)
-        return _Side(frame.color, depth, passed, leads(flow, fraction), finite, known)
-
-    lasts = (None, None, None), (None, None, None)
-    if offsets is not None:
-        last = offsets.alpha.astype(wide)
-        lasts = (offsets.forward, offsets.forward_depth, last), (offsets.backward, offsets.backward_depth, 1 - last)
-    sources = side(previous, flow, alpha, *lasts[0]), side(next, opposite, 1 - alpha, *lasts[1]), *epsilons
-    made, left = by_strips(partial(_part, options=options), flow.shape[0], sources)
-    return replace(made, offsets=Offsets(alpha, *left))
-
-
-def _checked(previous: Keyframe, next: Keyframe) -> Size:
-    size = check_keyframe("previous", previous)
-    check_keyframe("next", next, size=size)
-    hint = "interpolation (`complete_flows` derives one from the other)"
-    for name, flow in (("previous.forward_flow", previous.forward_flow), ("next.backward_flow", next.backward_flow)):
-        check_flow(name, check_present(name, flow, needed_by=hint), size=size)
-    return size
-
-
-def _resolve(previous: Keyframe, next: Keyframe, depth: DepthKind, visibility: Visibility) -> tuple[Any, Any]:
-    """What kind of depth there is, and how visibility is decided."""
-    check_choice("depth", depth, get_args(DepthKind))
-    check_choice("visibility", visibility, get_args(Visibility))
-    kind = depth if previous.depth is not None and next.depth is not None else "absent"
-    solid = previous.forward_flow.shape[2] == 3 and next.backward_flow.shape[2] == 3  # type: ignore[union-attr]
-    testable = kind == "metric" and solid
-    if visibility == "depth" and not testable:
-        raise ValueError("visibility: 'depth' needs metric depth in both keyframes and flows [H, W, 3]")
-    if visibility == "auto":
-        visibility = "depth" if testable else "round_trip"
-    return kind, visibility
 
 
 def interpolate_bidirectional(
@@ -304,62 +35,34 @@ def interpolate_bidirectional(
     stencil_ids: Sequence[int] | None = None,
     target_mode: TargetMode = "reproject",
     offsets: Offsets | None = None,
-    starts: Sequence[Start] = ("default", "dual", "latest"),
-    reach: int = 1,
-    iterations: int = 3,
-    solver: Solver = "fixed_point",
-    flow_filter: FlowFilter = "nearest",
-    choice: Choice = "depth",
-    depth: DepthKind = "metric",
-    visibility: Visibility = "auto",
-    epsilon_error: float | Float[ArrayLike, ""] = 0.5,
-    epsilon_depth: float | Float[ArrayLike, ""] = 0.05,
-    epsilon_trip: float | Float[ArrayLike, ""] = 1.0,
+    search: SearchOptions = SEARCH,
+    visibility: VisibilityOptions = VISIBILITY,
     filter: Filter = "bilinear",
-    shader: Shader | None = None,
-    shade: Shader | None = None,
+    shade_on_miss: Shader | None = None,
+    shade_attributes: Shader | None = None,
 ) -> Interpolation:
-    """The frame at t + alpha from the rendered frames at t and t + 1 and the 3D flows between them.
+    """The frame at t + alpha from the rendered frames at t and t + 1, by whatever is known of it.
 
-    Each pixel searches for its point in both frames (`iterative_search`), from several starts, of which the best
-    solution counts; a search hits where its error is below a threshold and its place inside the frame. Then (5.2)
-    1. both hit, at similar depths: the point with the smaller error; 2. both hit, at different depths: the nearer
-    point; one hits: that point; 3. neither: the smaller error. The point's place in the other frame follows from the
-    flow (eq. 14 and 15); where it is visible there the two colours are blended by alpha, elsewhere it is taken alone.
-
-    With a `target`, the geometry of the frame to be made, and no `stencil_ids`, `interpolate_assisted` makes the frame.
-    With `stencil_ids` the target's pixels of those ids are drawn over the image-based frame through one depth buffer
-    (section 6): reprojected, or, where the I-frames leave them out, as the target's own colour has them.
+    Without a `target` by `interpolate_image_based`. With a `target`, the geometry of the frame to be generated, by
+    `interpolate_assisted`. With `stencil_ids` as well, the target's pixels of those ids are drawn over the image-based
+    frame through one depth buffer (section 6): reprojected, or, where the I-frames leave them out, as the target's own
+    colour has them.
 
     Args:
-        previous: color `[H, W, C]`, any attributes, forward_flow, depth (may be absent). next: color, backward_flow,
-            depth.
-        alpha: in 0..1, traced; at 0 and 1 the frames are returned bit for bit.
+        previous: color `[H, W, C]`, any attributes, forward_flow, depth (may be absent).
+        next: color, backward_flow, depth.
+        alpha: in 0..1, traced; at 0 and 1 the image-based frames are returned bit for bit.
         target: depth, backward_flow to `previous`, forward_flow to `next` (see `camera_flow`), stencil. In the mode
             "render" color, depth, stencil.
         stencil_ids: which of the target's ids are drawn over; `None` = the whole frame is scene-assisted.
         target_mode: "reproject" or "render", as above.
-        offsets: those of the frame made last between the same two, for the start "latest".
-        starts: "default" (the pixel itself), "dual" (by the other frame's flow), "latest" (by the offsets of the frame
-            made last; left out without them).
-        reach: of the neighbourhood that "latest" takes the nearest surface's offset from.
-        iterations, solver, flow_filter: of the searches. Depths are fetched as the flow is. Across a silhouette
-            "bilinear" finds points of a surface that is not there; "nearest" misses, as it should.
-        choice: among the starts' solutions: "depth", the nearest point of those that hit, else the smallest error; or
-            "error", always the smallest, as the paper has it.
-        depth: "metric", the distance along the view axis; or "ordinal": only comparable between the two frames, smaller
-            is nearer, unchanged by the flow, and epsilon_depth is a difference. Without depth nothing is compared, and
-            points that hit count as the same.
-        visibility: of a point in the other frame: "depth": its depth there agrees with the buffer; "round_trip": the
-            other frame's flow leads back; "inside": it is in the frame; "auto": by depth where that is metric and both
-            flows have three components, else by the round trip.
-        epsilon_error: in pixels, a search with a smaller error hits. epsilon_depth: relative to the smaller depth.
-        epsilon_trip: in pixels.
+        offsets: as of `interpolate_image_based`.
+        search: as of `interpolate_image_based`.
+        visibility: as of `interpolate_image_based`; its `epsilon_depth` holds for the target as well.
         filter: of the colours, as in `backward_warp`.
-        shader: for pixels of the target visible in neither frame, see `interpolate_assisted`.
-        shade: called with the blended attributes `[H, W, C]`, gives the colour `[H, W, C']`: normals, texture
-            coordinates, ... are reprojected and lit anew (section 9, vertex-bound scenes); it may close over the light
-            of this frame. In the mode "render" the target's colour is drawn after it.
+        shade_on_miss: for pixels of the target visible in neither frame, see `interpolate_assisted`.
+        shade_attributes: called with the blended attributes, gives the colour; in the mode "render" the target's
+            colour is drawn after it.
 
     Returns:
         An `Interpolation`.
@@ -367,58 +70,62 @@ def interpolate_bidirectional(
     Convention:
         Each flow belongs to its own frame's grid and is added; pixels, x right, y down, integers are centres.
 
-    Edge cases:
-        A search that ends outside the frame misses, but where both miss its colour is the frame's edge. Flow that is
-        not finite misses. Depth that is not finite or not positive is as far as can be, and stays there. Errors that
-        differ by less than 0.001 pixels are equal: the point of the frame nearer in time is taken then (at 1/2 the
-        next), of two starts' the first, so that rounding decides nothing. Of equal depths that of the next frame is
-        taken. alpha 0 takes `previous`, 1 `next`, also where the motion is not finite.
-
     Gradient:
-        With respect to colours, flows and alpha, through the places that the searches found (implicit function theorem,
-        see `iterative_search`) and the weights; which point is taken, and whether it is visible, is held fixed, so that
-        thresholds and depths get 0 (but depths in the result). None with respect to `offsets`.
+        As of `interpolate_image_based` and `interpolate_assisted`; which of the two a pixel takes is held fixed.
 
     Raises:
         TypeError, ValueError: a field is absent that is needed, no floating-point array, or of another size; an option
             that is not listed, or does not go with the others.
 
     References:
-        Yang et al. 2011, sections 5, 6 and 9. Departures: one hit without the other is not printed; depths are compared
-        relatively; errors count as equal; searches that end outside miss, and "latest" leaves out offsets that missed;
-        round trips where there is no depth; choice="depth", flow_filter="nearest" by experiment.
+        Yang et al. 2011, sections 4, 5, 6 and 9.
     """
-    how = {"starts": starts, "reach": reach, "iterations": iterations, "solver": solver, "flow_filter": flow_filter}
-    how |= {"choice": choice, "depth": depth, "visibility": visibility, "filter": filter}
     check_choice("target_mode", target_mode, get_args(TargetMode))
-    check_scalar("alpha", alpha)
-    check_choice("filter", filter, get_args(Filter))
-    assisted = None
+    if target is None and stencil_ids is not None:
+        raise ValueError("stencil_ids: expected None without a target")
+    if target is not None and stencil_ids is None and target_mode == "render":
+        raise ValueError("stencil_ids: absent (None), but target_mode='render' needs it")
+    above = None
     if target is not None and target_mode == "reproject":
-        options = {"epsilon_depth": epsilon_depth, "filter": filter, "shader": shader, "shade": shade}
-        assisted = interpolate_assisted(previous, next, target, alpha, **options)
+        above = interpolate_assisted(
+            previous,
+            next,
+            target,
+            alpha,
+            epsilon_depth=visibility.epsilon_depth,
+            filter=filter,
+            shade_on_miss=shade_on_miss,
+            shade_attributes=shade_attributes,
+        )
         if stencil_ids is None:
-            return assisted
-    size = _checked(previous, next)
-    if (target is None) != (stencil_ids is None):
-        raise ValueError("stencil_ids, target: expected both or neither here, got one")
-    thresholds = (epsilon_error, epsilon_depth, epsilon_trip)
-    made = _interpolate(*slim(previous, next), alpha, offsets, *thresholds, options=_options(previous, next, **how))
-    # not compiled with the rest: what it closes over may change from frame to frame
-    made = made if shade is None else replace(made, color=shade(made.color))
+            return above
+    below = interpolate_image_based(
+        previous,
+        next,
+        alpha,
+        offsets=offsets,
+        search=search,
+        visibility=visibility,
+        filter=filter,
+        shade_attributes=shade_attributes,
+    )
     if target is None or stencil_ids is None:
-        return made
+        return below
+    size = check_keyframe("previous", previous)
     stencil = check_present("target.stencil", target.stencil, needed_by="stencil_ids")
     check_image("target.stencil", stencil, size=size, channels=1)
-    if assisted is None:
-        color = check_present("target.color", target.color, needed_by="target_mode='render'")
-        check_image("target.color", color, size=size, channels=made.color.shape[2])
-        rendered = jnp.full(size, CASES.index("rendered"), made.case.dtype)
-        over = check_present("target.depth", target.depth, needed_by="target_mode='render'")
-        check_image("target.depth", over, size=size, channels=1)
-        assisted = replace(made, color=color, depth=over, case=rendered)
-    epsilon = jnp.asarray(epsilon_depth).astype(made.weight.dtype)
-    return _drawn_ids(made, assisted, stencil, epsilon, stencil_ids=tuple(int(i) for i in stencil_ids))
+    above = _rendered(below, target, size) if above is None else above
+    epsilon = jnp.asarray(visibility.epsilon_depth).astype(below.weight.dtype)
+    return _drawn_ids(below, above, stencil, epsilon, stencil_ids=tuple(int(i) for i in stencil_ids))
+
+
+def _rendered(below: Interpolation, target: Keyframe, size: Size) -> Interpolation:
+    """The target's own colour and depth, as a layer over an interpolated frame."""
+    color = check_present("target.color", target.color, needed_by="target_mode='render'")
+    check_image("target.color", color, size=size, channels=below.color.shape[2])
+    depth = check_present("target.depth", target.depth, needed_by="target_mode='render'")
+    check_image("target.depth", depth, size=size, channels=1)
+    return replace(below, color=color, depth=depth, case=jnp.full(size, CASES.index("rendered"), below.case.dtype))
 
 
 @partial(jax.jit, static_argnames=("stencil_ids",))
@@ -426,20 +133,3 @@ def _drawn_ids(below, above, stencil, epsilon, *, stencil_ids):
     ids = jnp.round(stencil[..., 0]).astype(jnp.int32)
     covered = jnp.isin(ids, jnp.asarray(stencil_ids, jnp.int32))
     return drawn_over(below, above, covered, epsilon)
-
-
-def _options(previous, next, *, starts, reach, iterations, solver, flow_filter, choice, depth, visibility, filter):
-    check_search(iterations=iterations, solver=solver, filter=flow_filter)
-    check_choice("choice", choice, get_args(Choice))
-    for start in starts:
-        check_choice("starts", start, get_args(Start))
-    if not isinstance(reach, int) or reach < 0:
-        raise ValueError(f"reach: expected an integer of at least 0, got {reach!r}")
-    kind, visibility = _resolve(previous, next, depth, visibility)
-    return _Options(tuple(starts), iterations, solver, flow_filter, filter, choice, kind, visibility, reach)
-
-
-def slim(previous: Keyframe, next: Keyframe) -> tuple[Keyframe, Keyframe]:
-    """Only what interpolation reads of the frames around."""
-    first = Keyframe(color=previous.color, depth=previous.depth, forward_flow=previous.forward_flow)
-    return first, Keyframe(color=next.color, depth=next.depth, backward_flow=next.backward_flow)

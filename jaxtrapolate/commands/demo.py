@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from jaxtrapolate.commands.evaluate import evaluate
+from jaxtrapolate.commands.evaluate import Request, evaluate_into
 from jaxtrapolate.commands.inputs import add_fresh, check_count, open_methods, parse_size, steps, terminal
 from jaxtrapolate.commands.tables import print_table
 from jaxtrapolate.methods import method_names
@@ -34,7 +34,8 @@ def run(options: argparse.Namespace) -> None:
     methods, unavailable = open_methods(method_names())
     console = terminal(stderr=True)
     with steps(console) as step:
-        results = evaluate(sequence, methods, folder, unavailable=unavailable, fresh=options.fresh, step=step)
+        request = Request(methods, unavailable, fresh=options.fresh)
+        results = evaluate_into(sequence, request, folder, step=step)
     print_table(results, terminal())
     console.print(
         f"open {folder / 'report.html'}; numbers in {folder / 'results.json'}", soft_wrap=True, highlight=False

@@ -16,6 +16,7 @@ from jaxtrapolate.errors import InputError
 from jaxtrapolate.files import Sequence, open_sequence
 from jaxtrapolate.files.listing import folder_name
 from jaxtrapolate.methods import Method, load, method_names
+from jaxtrapolate.methods.options import parsed
 from jaxtrapolate.metrics import Metric, metric_names
 from jaxtrapolate.metrics import load as load_metric
 
@@ -178,6 +179,13 @@ def check_count(option: str, value: int) -> int:
     return value
 
 
+def check_factor(value: int) -> int:
+    """A factor of frame rates, 2 to 1000."""
+    if not 2 <= value <= 1000:
+        raise InputError(f"--factor: expected 2 to 1000, got {value}")
+    return value
+
+
 def parse_size(text: str) -> tuple[int, int]:
     """(H, W) from "WxH"."""
     match = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)
@@ -240,28 +248,59 @@ def open_method(name: str, weights: str | None) -> Method:
         raise InputError(f"--weights {name}: {error}") from error
 
 
+def split_options(text: str) -> tuple[str, dict[str, str]]:
+    """A method's name and the texts of its options, of NAME:OPTION=VALUE:...
+
+    Raises:
+        ValueError: an option without a value, or one that is given twice.
+    """
+    name, *given = text.split(":")
+    options: dict[str, str] = {}
+    for part in given:
+        option, separator, value = part.partition("=")
+        if not option or not separator or not value or option in options:
+            raise ValueError(f"{text}: expected NAME:OPTION=VALUE:..., each option once, got {part!r}")
+        options[option] = value
+    return name, options
+
+
 def open_methods(
     names: str | Iterable[str], *, option: str = "--methods", weights: list[str] | None = None
 ) -> tuple[dict[str, Method], dict[str, str]]:
-    """Methods by name, of a comma-separated list; and of those that have no weights, why they cannot be had.
+    """Methods of a comma-separated list of NAME:OPTION=VALUE:..., by what was said of each.
+
+    So that a method stands beside itself with other options. And of those that have no weights, why they cannot be had.
+    Tuples are written 1-3-5.
 
     Args:
         names: the list. option: where it was given.
-        weights: arguments NAME=FILE.
+        weights: arguments NAME=FILE, for every mention of that method.
 
     Raises:
-        InputError: an unknown name, none at all, or weights that cannot be used or belong to a method not named.
+        InputError: an unknown name or option, none at all, or weights that cannot be used or belong to a method not
+            named.
     """
     listed = [n.strip() for n in names.split(",")] if isinstance(names, str) else list(names)
     files = parse_weights(weights or [])
-    methods, unavailable = {}, {}
-    for name in filter(None, listed):
+    methods, unavailable, plain = {}, {}, {}
+    for text in filter(None, listed):
+        try:
+            name, given = split_options(text)
+        except ValueError as error:
+            raise InputError(f"{option}: {error}") from error
         if name not in method_names():
             raise InputError(f"{option}: no method {name!r}; there are {', '.join(method_names())}")
         try:
-            methods[name] = open_method(name, files.pop(name, None))
+            plain[name] = plain[name] if name in plain else open_method(name, files.get(name))
         except ValueError as error:
-            unavailable[name] = str(error)
+            unavailable[text] = str(error)
+            continue
+        try:
+            values = parsed(f"method {name!r}", plain[name].settings, given)
+            methods[text] = plain[name].replace(**values) if values else plain[name]
+        except ValueError as error:
+            raise InputError(f"{option}: {error}") from error
+    files = {name: path for name, path in files.items() if name not in plain}
     if not methods and not unavailable:
         raise InputError(f"{option}: expected names separated by commas, of {', '.join(method_names())}")
     if files:

@@ -21,6 +21,12 @@ def parser() -> argparse.ArgumentParser:
         description="Make the frames between rendered frames, and say how good and how fast that is.",
     )
     top.add_argument("--version", action="version", version=f"jaxtrapolate {__version__}")
+    top.add_argument(
+        "--no-compile-cache",
+        action="store_true",
+        help="compile everything anew; compiled programs are kept in the user's cache folder, or in the folder that "
+        "JAX_COMPILATION_CACHE_DIR names",
+    )
     subparsers = top.add_subparsers(required=True, metavar="COMMAND")
     for command in (demo, check, generate, evaluate, methods, render, scenes, train, import_weights):
         command.add_parser(subparsers)
@@ -33,6 +39,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from jaxtrapolate.runtime.memory import keep_memory
 
     keep_memory()
+    if options.no_compile_cache:
+        from jaxtrapolate.runtime.compiled import forget_compiled_programs
+
+        forget_compiled_programs()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files need not be text

@@ -2,19 +2,19 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from jaxtrapolate.commands.inputs import Input, Step
 from jaxtrapolate.errors import InputError
 from jaxtrapolate.evaluation.score import mean_over_inputs
 from jaxtrapolate.report import write_report
+from jaxtrapolate.results import InputResult, MethodResult, Results
 from jaxtrapolate.runtime.output import open_output, write_json
 from jaxtrapolate.runtime.timing import machine
 
 
 def evaluate_many(
-    inputs: list[Input], evaluate: Callable[..., dict[str, Any]], folder: Path, *, fresh: bool = False, step: Step
-) -> tuple[dict[str, Any] | None, dict[str, str]]:
+    inputs: list[Input], evaluate: Callable[..., Results], folder: Path, *, fresh: bool = False, step: Step
+) -> tuple[Results | None, dict[str, str]]:
     """Evaluates inputs one after the other, and writes what they have in common to `folder`.
 
     Args:
@@ -34,16 +34,16 @@ def evaluate_many(
         if not done:
             return None, failed
         results = over_all(list(done.values()), failed)
-        write_json(folder / "results.json", results)
+        write_json(folder / "results.json", results.to_json())
         write_report(results, folder)
     return results, failed
 
 
 def _each(
-    inputs: list[Input], evaluate: Callable[..., dict[str, Any]], folder: Path, step: Step
-) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    inputs: list[Input], evaluate: Callable[..., Results], folder: Path, step: Step
+) -> tuple[dict[str, tuple[InputResult, Results]], dict[str, str]]:
     """What the results of all inputs say about each, by name, and why the others could not be used, by argument."""
-    done: dict[str, dict[str, Any]] = {}
+    done: dict[str, tuple[InputResult, Results]] = {}
     failed: dict[str, str] = {}
     for index, entry in enumerate(inputs):
         furthest = float(index)
@@ -56,7 +56,7 @@ def _each(
         try:
             follow("read", 0, 1)
             results = evaluate(entry.open(), folder=folder / entry.name, reuse=True, step=follow)
-            done[entry.name] = _entry(entry.name, results)
+            done[entry.name] = (_summary(entry.name, results), results)
         except InputError as error:
             reason = " ".join(str(error).split())
             failed[entry.text] = (
@@ -65,48 +65,51 @@ def _each(
     return done, failed
 
 
-def _entry(name: str, results: dict[str, Any]) -> dict[str, Any]:
-    """What the results of all inputs say about one: everything but single frames and stages."""
-    methods = {
-        method: {key: value for key, value in scores.items() if key not in ("frames", "stages", "left_out")}
-        for method, scores in results["methods"].items()
-    }
-    kept = {key: results[key] for key in ("size", "hdr", "settings", "metrics", "skipped")}
-    return kept | {"input": results["input"], "folder": name, "frames": len(results["frames"]), "methods": methods}
+def _summary(name: str, results: Results) -> InputResult:
+    """What the results over all inputs say about one: everything but single frames and stages."""
+    return InputResult(
+        input=results.input,
+        folder=name,
+        size=results.size,
+        hdr=results.hdr,
+        frames=len(results.frames),
+        methods=results.methods,
+        skipped=results.skipped,
+    )
 
 
-def over_all(inputs: list[dict[str, Any]], failed: dict[str, str]) -> dict[str, Any]:
+def over_all(done: list[tuple[InputResult, Results]], failed: dict[str, str]) -> Results:
     """The results over all inputs: their table, and for each method the means of `mean_over_inputs`."""
-    first = inputs[0]
-    common = ("version", "code", "methods", "metrics", "frames", "pictures", "video")
-    settings = {k: first["settings"][k] for k in common}
-    methods = mean_over_inputs([i["methods"] for i in inputs], metrics=first["metrics"])
-    in_order = [name for name in settings["methods"] if name in methods]
+    inputs, first = [entry for entry, _ in done], done[0][1]
+    common = ("version", "code", "methods", "metrics", "factor", "frames", "pictures", "video")
+    settings = {k: first.settings[k] for k in common if k in first.settings}
+    methods = mean_over_inputs([i.methods for i in inputs], metrics=first.metrics)
+    named = [*settings["methods"]]
     skipped = {}
-    for name in settings["methods"]:
-        if reasons := [i["skipped"][name] for i in inputs if name in i["skipped"]]:
+    for name in named:
+        if reasons := [i.skipped[name] for i in inputs if name in i.skipped]:
             skipped[name] = f"on {len(reasons)} of {len(inputs)} inputs: {reasons[0]}"
-    return {
-        "input": f"{len(inputs)} of {len(inputs) + len(failed)} inputs" if failed else f"{len(inputs)} inputs",
-        "machine": machine(),
-        "hdr": first["hdr"] if len({i["hdr"] for i in inputs}) == 1 else None,
-        "size": first["size"] if len({tuple(i["size"]) for i in inputs}) == 1 else None,
-        "settings": settings,
-        "metrics": first["metrics"],
-        "notes": _notes(inputs, methods),
-        "methods": {name: methods[name] for name in in_order},
-        "skipped": skipped,
-        "inputs": [{k: v for k, v in i.items() if k not in ("settings", "metrics")} for i in inputs],
-        "failed": failed,
-    }
+    return Results(
+        input=f"{len(inputs)} of {len(inputs) + len(failed)} inputs" if failed else f"{len(inputs)} inputs",
+        machine=machine(),
+        size=first.size if len({i.size for i in inputs}) == 1 else None,
+        hdr=first.hdr if len({i.hdr for i in inputs}) == 1 else None,
+        settings=settings,
+        metrics=first.metrics,
+        methods={name: methods[name] for name in named if name in methods},
+        notes=tuple(_notes(inputs, methods)),
+        skipped=skipped,
+        inputs=tuple(inputs),
+        failed=failed,
+    )
 
 
-def _notes(inputs: list[dict[str, Any]], methods: dict[str, Any]) -> list[str]:
+def _notes(inputs: list[InputResult], methods: dict[str, MethodResult]) -> list[str]:
     notes = []
-    counts = {m["inputs"] for m in methods.values()}
+    counts = {m.inputs for m in methods.values()}
     if counts != {len(inputs)}:
         over = str(counts.pop()) if len(counts) == 1 else "differing numbers"
         notes.append(f"means are over {over} of {len(inputs)} inputs: those on which every method ran, none exactly")
-    if len({tuple(i["size"]) for i in inputs}) > 1:
+    if len({i.size for i in inputs}) > 1:
         notes.append("milliseconds are means over inputs of different sizes")
     return notes

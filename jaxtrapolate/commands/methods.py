@@ -8,6 +8,7 @@ from rich.table import Table
 from jaxtrapolate.commands.inputs import terminal
 from jaxtrapolate.errors import InputError
 from jaxtrapolate.methods import Method, load, method_description, method_names
+from jaxtrapolate.methods.options import written
 
 
 def add_parser(subparsers: Any) -> None:
@@ -15,8 +16,8 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "methods",
         help="the methods, or what one of them consists of",
-        description="Lists the methods, those of other installed packages too; with a NAME, its stages: what each "
-        "reads, and which are left out where that is missing.",
+        description="Lists the methods, those of other installed packages too; with a NAME, its options, and its "
+        "stages: what each reads, and which are left out where that is missing.",
     )
     parser.add_argument("name", nargs="?", metavar="NAME", help=f"of {', '.join(method_names())}")
     parser.set_defaults(run=run)
@@ -42,6 +43,16 @@ def run(options: argparse.Namespace) -> None:
     if method is None:
         return
     out.print(f"{method.kind}; rendered frames before + after: {_frames(method)}; size of the output: {method.scale} x")
+    if method.options:
+        table = Table(
+            title=f"options, as in {options.name}:{method.options[0].name}={written(method.options[0].value)}"
+        )
+        for column in ("option", "default", "may be", "", "what it is"):
+            table.add_column(column)
+        for option in method.options:
+            again = "compiled anew" if option.static else ""
+            table.add_row(option.name, written(option.default), option.allowed, again, option.doc)
+        out.print(table)
     table = Table(title="stages, in order")
     for column in ("stage", "reads", "needed"):
         table.add_column(column)

@@ -21,6 +21,9 @@ def end(*_: object) -> None:
 def script() -> int:
     """Runs the command that the process's arguments ask for; its exit status."""
     signal.signal(signal.SIGINT, end)
+    from jaxtrapolate.runtime.compiled import keep_compiled_programs
+
+    keep_compiled_programs()
     from jaxtrapolate.commands.main import main
 
     status = main()

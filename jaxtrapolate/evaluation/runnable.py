@@ -1,13 +1,16 @@
 """Which methods can be scored on a sequence, why the others cannot, and what those that can cost the rest."""
 
+from collections.abc import Mapping
+
 from jaxtrapolate.errors import InputError
-from jaxtrapolate.evaluation.windows import arguments, held_back, windows
+from jaxtrapolate.evaluation.schedule import held_back_slots
+from jaxtrapolate.evaluation.windows import arguments, held_back, hidden, load
 from jaxtrapolate.files import Sequence, runs
 from jaxtrapolate.methods import Method
 
 
 def runnable(
-    sequence: Sequence, methods: dict[str, Method], unavailable: dict[str, str]
+    sequence: Sequence, methods: Mapping[str, Method], unavailable: Mapping[str, str], *, factor: int = 2
 ) -> tuple[dict[str, Method], dict[str, str], dict[str, dict[str, list[str]]]]:
     """The methods that can be scored, why the others cannot, and what stages are left out of each that can.
 
@@ -16,39 +19,48 @@ def runnable(
     """
     usable, skipped, left_out = {}, dict(unavailable), {}
     for name, method in methods.items():
-        numbers = held_back(sequence, past=method.past, future=method.future)
-        if not numbers:
+        if method.scale not in (1, sequence.scale):
+            skipped[name] = f"generates frames {method.scale} times as large, which the input does not have as truth"
+            continue
+        slots = held_back_slots(sequence, past=method.past, future=method.future, factor=factor)
+        chosen = next((slot for slot in slots if slot.full and not slot.rendered), None)
+        if chosen is None:
             skipped[name] = (
-                f"too few frames, needs {_window_length(method)} in a row without a gap; the longest row of the "
-                f"{len(sequence.numbers)} has {max(map(len, runs(sequence)))}"
+                f"too few frames, needs {_window_length(method, factor)} in a row without a gap; the longest row of "
+                f"the {len(sequence.numbers)} has {max(map(len, runs(sequence)))}"
             )
             continue
-        window = next(iter(windows(sequence, numbers[:1], past=method.past, future=method.future)))
-        if window.truth.color is None:
-            raise InputError(f"{sequence.name}: frame {window.number} has no colour to compare with; use generate")
-        given = arguments(method, window)
+        tried = [slots[0], chosen] if method.memory else [chosen]
         try:
-            method.active(*given)
-            usable[name], left_out[name] = method, method.missing(*given)
+            for slot, window in load(sequence, tried, hidden=hidden(sequence, factor=factor)):
+                if window.truth.color is None:
+                    text = f"frame {slot.number} has no colour to compare with; use generate"
+                    raise InputError(f"{sequence.name}: {text}")
+                method.active(*arguments(method, window))
+                left_out[name] = method.missing(*arguments(method, window))
+            usable[name] = method
         except ValueError as error:
             skipped[name] = str(error)
+            left_out.pop(name, None)
     if not usable:
         reasons = "; ".join(f"{name}: {why}" for name, why in skipped.items())
         raise InputError(f"{sequence.name}: no method can run: {reasons}")
     return usable, skipped, left_out
 
 
-def _window_length(method: Method) -> int:
+def _window_length(method: Method, factor: int) -> int:
     """How many frames in a row a method's window has, the held-back one included."""
-    return 2 * method.past + max(0, 2 * method.future - 1)
+    if not method.future:
+        return factor * (method.past - 1) + 2
+    return factor * (method.past - 1) + 1 + factor * method.future
 
 
-def history_costs(sequence: Sequence, methods: dict[str, Method]) -> list[str]:
+def history_costs(sequence: Sequence, methods: Mapping[str, Method], *, factor: int = 2) -> list[str]:
     """For methods that need more frames around a held-back one than the others: how many scored frames that costs."""
 
-    def count(chosen: dict[str, Method]) -> int:
+    def count(chosen: Mapping[str, Method]) -> int:
         past, future = max(m.past for m in chosen.values()), max(m.future for m in chosen.values())
-        return len(held_back(sequence, past=past, future=future))
+        return len(held_back(sequence, past=past, future=future, factor=factor))
 
     notes, all_of_them = [], count(methods)
     for what, need in (("before", lambda m: m.past), ("after", lambda m: m.future)):

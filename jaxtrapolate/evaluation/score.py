@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,12 +11,15 @@ from jaxtyping import Array, Float
 from jaxtrapolate.checks import ArrayLike, check_present
 from jaxtrapolate.evaluation.windows import Window
 from jaxtrapolate.files import Sequence, around
+from jaxtrapolate.methods.method import rendered
 from jaxtrapolate.metrics import Metric, psnr
 from jaxtrapolate.metrics import load as load_metric
 from jaxtrapolate.ops.causes import CAUSES, cause_map, disoccluded
 from jaxtrapolate.ops.depth import surfaces_of
+from jaxtrapolate.ops.motion import chain_motion
 from jaxtrapolate.ops.radiance import srgb_encode, tonemap
-from jaxtrapolate.records import replace
+from jaxtrapolate.records import Frame, replace
+from jaxtrapolate.results import CauseScore, FrameScore, MethodResult, RunTime
 
 DEFAULT_METRICS = ("psnr", "ssim")
 """What is scored where nothing else is named; "psnr" always is, for it is told apart by cause."""
@@ -27,22 +30,50 @@ def display(color: Float[ArrayLike, "h w 3"], *, hdr: bool) -> Float[Array, "h w
     return tonemap(color) if hdr else srgb_encode(jnp.clip(color, 0, 1))
 
 
-def causes_of(sequence: Sequence, window: Window) -> np.ndarray | None:
+def truth_for(window: Window, image: Float[ArrayLike, "h w 3"]) -> Frame:
+    """The true frame of the size of an image.
+
+    Raises:
+        ValueError: there is none.
+    """
+    sizes = []
+    for truth in (window.truth, window.larger):
+        if truth is not None and truth.color is not None:
+            if truth.color.shape[:2] == image.shape[:2]:
+                return truth
+            sizes.append(f"{truth.color.shape[1]}x{truth.color.shape[0]}")
+    raise ValueError(f"image: expected a size of {' or '.join(sizes)}, got {image.shape[1]}x{image.shape[0]}")
+
+
+def causes_of(sequence: Sequence, window: Window, *, larger: bool = False) -> np.ndarray | None:
     """The `cause_map` of a window: exact holes where the sequence knows its 3D flow, else by the hole masks.
 
+    The source is the newest rendered frame; the exact holes are those between neighbours of the numbering, so several
+    held-back frames in a row have their causes by the masks, and so has the size of the output where `larger` is set.
     `None` without motion vectors.
     """
-    motion = window.target.motion
+    newest = rendered(window.history)[0]
+    between, source_frame = window.history[newest + 1 :], window.history[newest]
+    truth, motion = window.truth, window.target.motion
+    if larger:
+        if sequence.larger is None or window.larger is None:
+            raise ValueError("larger: expected a sequence that has larger frames")
+        run = around(sequence, window.number, before=len(window.history) - newest)
+        source_frame, *between = (jax.device_put(sequence.larger.frame(n)) for n in run[:-1])
+        truth, motion = window.larger, window.larger.motion
+    for frame in reversed(between):
+        motion = None if motion is None or frame.motion is None else chain_motion(motion, frame.motion)
     if motion is None:
         return None
-    previous, number = around(sequence, window.number, before=1)
-    target, source = sequence.keyframe(number), sequence.keyframe(previous)
     hidden, metric = None, sequence.depth == "metric"
-    if metric and target is not None and source is not None:
-        exact = target.backward_flow is not None and source.depth is not None
-        target, source = surfaces_of(target, window.truth), surfaces_of(source, window.history[-1])
-        hidden = disoccluded(replace(target, color=None), replace(source, color=None)) if exact else None
-    return np.asarray(cause_map(window.truth, window.history[-1], motion, hidden=hidden, metric_depth=metric))
+    if metric and not between and not larger:
+        previous, number = around(sequence, window.number, before=1)
+        target, source = sequence.keyframe(number), sequence.keyframe(previous)
+        if target is not None and source is not None:
+            exact = target.backward_flow is not None and source.depth is not None
+            target, source = surfaces_of(target, truth), surfaces_of(source, source_frame)
+            hidden = disoccluded(replace(target, color=None), replace(source, color=None)) if exact else None
+    return np.asarray(cause_map(truth, source_frame, motion, hidden=hidden, metric_depth=metric))
 
 
 def score(
@@ -53,34 +84,34 @@ def score(
     *,
     hdr: bool,
     metrics: Iterable[Metric] | None = None,
-) -> dict[str, Any]:
-    """PSNR of a made frame, whole and by cause, and its other metrics; psnr and ssim where none are named.
+    distance: int = 1,
+    ms: float | None = None,
+) -> FrameScore:
+    """PSNR of a generated frame, whole and by cause, and its other metrics; psnr and ssim where none are named.
 
     Pixels that were not finite in the input are left out. A metric that cannot be had (a frame smaller than its window)
-    is None, and "unscored" says why. Metrics of clips are not for here.
+    is None, and `unscored` says why. Metrics of clips are not for here.
     """
-    color = check_present("truth.color", window.truth.color, needed_by="score")
+    color = check_present("truth.color", truth_for(window, image).color, needed_by="score")
     spaces = {"display": (display(image, hdr=hdr), display(color, hdr=hdr)), "linear": (image, color)}
-    made, truth = spaces["display"]
-    valid = np.ones((*made.shape[:2], 1), bool) if invalid is None else ~invalid[..., None]
-    result: dict[str, Any] = {"number": window.number, "psnr": float(psnr(made, truth, mask=valid))}
+    generated, truth = spaces["display"]
+    valid = np.ones((*generated.shape[:2], 1), bool) if invalid is None else ~invalid[..., None]
+    found: dict[str, float | None] = {}
+    unscored: dict[str, str] = {}
     for metric in map(load_metric, DEFAULT_METRICS) if metrics is None else metrics:
         if metric.name == "psnr" or metric.per == "clip":
             continue
         try:
-            result[metric.name] = metric(*spaces[metric.space], mask=None if invalid is None else valid)
+            found[metric.name] = metric(*spaces[metric.space], mask=None if invalid is None else valid)
         except ValueError as error:
-            result[metric.name] = None
-            result.setdefault("unscored", {})[metric.name] = str(error)
-    result["by_cause"] = {}
-    if causes is None:
-        return result
-    for i, cause in enumerate(CAUSES):
-        mask = (causes[..., None] == i) & valid
+            found[metric.name], unscored[metric.name] = None, str(error)
+    by_cause = {}
+    for i, cause in enumerate(CAUSES if causes is not None else ()):
+        mask = (np.asarray(causes)[..., None] == i) & valid
         if mask.any():
-            decibels = float(psnr(made, truth, mask=mask))
-            result["by_cause"][cause] = {"psnr": decibels, "share": float(mask.mean())}
-    return result
+            by_cause[cause] = CauseScore(float(psnr(generated, truth, mask=mask)), float(mask.mean()))
+    whole = float(psnr(generated, truth, mask=valid))
+    return FrameScore(window.number, distance, whole, found, by_cause, ms, unscored)
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
@@ -88,57 +119,79 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def mean_over_frames(frames: list[dict], *, metrics: Iterable[str] = DEFAULT_METRICS) -> dict[str, Any]:
+def mean_over_frames(frames: list[FrameScore], *, metrics: Iterable[str] = DEFAULT_METRICS) -> MethodResult:
     """Means of the scores of several frames; a cause's dB over the frames in which it occurs, its share over all."""
     by_cause = {}
     for cause in CAUSES:
-        found = [f["by_cause"][cause] for f in frames if cause in f["by_cause"]]
+        found = [f.by_cause[cause] for f in frames if cause in f.by_cause]
         if found:
-            share = sum(f["share"] for f in found) / len(frames)
-            by_cause[cause] = {"psnr": _mean(f["psnr"] for f in found), "share": share}
-    names = dict.fromkeys(("psnr", *metrics))
-    return {n: _mean(f.get(n) for f in frames) for n in names} | {"by_cause": by_cause}
+            share = sum(c.share or 0.0 for c in found) / len(frames)
+            by_cause[cause] = CauseScore(_mean(c.psnr for c in found), share)
+    distances = sorted({f.distance for f in frames})
+    apart = {d: _mean(f.psnr for f in frames if f.distance == d) for d in distances}
+    spent = [f.ms for f in frames if f.ms is not None]
+    low, median, high = (float(q) for q in np.percentile(spent, (25, 50, 75))) if spent else (None, None, None)
+    return MethodResult(
+        psnr=_mean(f.psnr for f in frames),
+        metrics={n: _mean(f.metrics.get(n) for f in frames) for n in metrics if n != "psnr"},
+        ms=RunTime(median, None if high is None or low is None else high - low),
+        by_cause=by_cause,
+        by_distance=apart if len(apart) > 1 else {},
+        frames=tuple(frames),
+    )
 
 
 def mean_over_inputs(
-    inputs: list[Mapping[str, Any]], *, metrics: Iterable[str] = DEFAULT_METRICS
-) -> dict[str, dict[str, Any]]:
+    inputs: list[Mapping[str, MethodResult]], *, metrics: Iterable[str] = DEFAULT_METRICS
+) -> dict[str, MethodResult]:
     """Means of what `mean_over_frames` gave for each method on several inputs, on equal footing.
 
     Args:
-        inputs: for each input its methods' scores by name, with "ms" as {"median", "iqr", "compile"}.
+        inputs: for each input its methods' scores by name.
         metrics: names.
 
     Returns:
         For each method what it had for one input. Only inputs on which all methods ran and none was exact (still
-        frames: infinite dB) count; where there is none such, those on which all ran, or else all inputs. "inputs" is
+        frames: infinite dB) count; where there is none such, those on which all ran, or else all inputs. `inputs` is
         how many. Where a score of some method is infinite or not there, the input has no part in the mean of that score
         for all methods. A cause's dB is the mean over the inputs in which it occurs, its share over all that count.
         Compilation is the sum over all inputs.
     """
     names = list(dict.fromkeys(name for methods in inputs for name in methods))
     shared = [i for i in inputs if all(name in i for name in names)] or inputs
-    shared = [i for i in shared if not any(m["psnr"] == math.inf for m in i.values())] or shared
+    shared = [i for i in shared if not any(m.psnr == math.inf for m in i.values())] or shared
 
-    def means(pick: Callable[[Any], float | None]) -> dict[str, float | None]:
+    def means(pick: Callable[[MethodResult], float | None]) -> dict[str, float | None]:
         rows = [{n: pick(i[n]) for n in names if n in i} for i in shared]
         rows = [r for r in rows if all(v is not None for v in r.values())]
         rows = [r for r in rows if all(v is not None and math.isfinite(v) for v in r.values())] or rows
         return {n: _mean(r[n] for r in rows if n in r) for n in names}
 
-    result: dict[str, dict[str, Any]] = {n: {"inputs": sum(n in i for i in shared), "by_cause": {}} for n in names}
-    for metric in dict.fromkeys(("psnr", *metrics)):
-        for name, value in means(lambda m, metric=metric: m.get(metric)).items():
-            result[name][metric] = value
+    whole = means(lambda m: m.psnr)
+    others = {k: means(lambda m, k=k: m.metrics.get(k)) for k in dict.fromkeys(metrics) if k != "psnr"}
+    found: dict[str, dict[str, CauseScore]] = {n: {} for n in names}
     for cause in CAUSES:
-        here = [i for i in shared if any(cause in m["by_cause"] for m in i.values())]
-        for name, value in means(lambda m, cause=cause: m["by_cause"].get(cause, {}).get("psnr")).items():
-            if here:
-                shares = [i[name]["by_cause"].get(cause, {}).get("share", 0.0) for i in shared if name in i]
-                result[name]["by_cause"][cause] = {"psnr": value, "share": _mean(shares)}
-    for name in names:
-        spent = [i[name]["ms"] for i in shared if name in i]
-        result[name]["ms"] = {key: _mean(s.get(key) for s in spent) for key in ("median", "iqr")}
-        compiled = [i[name]["ms"].get("compile") for i in inputs if name in i]
-        result[name]["ms"]["compile"] = sum(c for c in compiled if c is not None)
-    return result
+        here = [i for i in shared if any(cause in m.by_cause for m in i.values())]
+        decibels = means(lambda m, c=cause: m.by_cause[c].psnr if c in m.by_cause else None)
+        for name in names if here else ():
+            shares = [
+                (i[name].by_cause[cause].share if cause in i[name].by_cause else 0.0) for i in shared if name in i
+            ]
+            found[name][cause] = CauseScore(decibels[name], _mean(shares))
+    distances = sorted({d for i in shared for m in i.values() for d in m.by_distance})
+    apart = {d: means(lambda m, d=d: m.by_distance.get(d)) for d in distances}
+
+    def result(name: str) -> MethodResult:
+        spent = [i[name].ms for i in shared if name in i]
+        compiled = [i[name].ms.compile or 0.0 for i in inputs if name in i]
+        cached = any(i[name].ms.cached for i in inputs if name in i)
+        return MethodResult(
+            psnr=whole[name],
+            metrics={k: v[name] for k, v in others.items()},
+            ms=RunTime(_mean(s.median for s in spent), _mean(s.iqr for s in spent), sum(compiled), cached=cached),
+            by_cause=found[name],
+            by_distance={d: v[name] for d, v in apart.items()},
+            inputs=sum(name in i for i in shared),
+        )
+
+    return {name: result(name) for name in names}

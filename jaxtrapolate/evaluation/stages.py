@@ -1,14 +1,24 @@
 """How long each stage of a method takes on its own."""
 
+from typing import Any
+
 from jaxtrapolate.evaluation.windows import Window, arguments
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.runtime.timing import Timing, measure
 
 
-def time_stages(method: Method, window: Window, *, repeats: int = 5) -> dict[str, Timing]:
-    """Each stage of a method on its own; their sum exceeds the whole, in which XLA fuses across stages."""
+def time_stages(method: Method, window: Window, *, carry: Any = None, repeats: int = 5) -> dict[str, Timing]:
+    """Each stage of a method on its own; their sum exceeds the whole, in which XLA fuses across stages.
+
+    Args:
+        method: any.
+        window: the frame to be generated and what surrounds it.
+        carry: what a method with memory remembers; `None` starts it anew.
+        repeats: runs of each stage that count.
+    """
     history, target, future = arguments(method, window)
-    values = method.first_values(method.init(history, target), history, target, future)
+    carry = method.init(history, target) if carry is None else carry
+    values = method.first_values(carry, history, target, future)
     timings = {}
     for stage in method.active(history, target, future):
         run = method.jitted_stages[stage.name]

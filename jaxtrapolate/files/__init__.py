@@ -12,7 +12,7 @@ from typing import Any
 
 from jaxtrapolate.errors import InputError as InputError
 from jaxtrapolate.files.description import SETTINGS_NAME as SETTINGS_NAME
-from jaxtrapolate.files.description import read_settings
+from jaxtrapolate.files.description import Settings, read_settings
 from jaxtrapolate.files.exr import read_exr as read_exr
 from jaxtrapolate.files.exr import write_exr as write_exr
 from jaxtrapolate.files.image import read_png as read_png
@@ -57,6 +57,18 @@ def open_sequence(
         InputError: one line that names the file and the remedy: no such folder, a file, an empty folder, nothing that
             a reader knows, a missing file, files of different sizes, a TOML file or `motion` that cannot be used.
     """
+    return _open(path, motion=motion, settings=settings, strict=strict)
+
+
+def _open(
+    path: str | os.PathLike[str],
+    *,
+    motion: str | MotionConvention | None = None,
+    settings: str | os.PathLike[str] | None = None,
+    strict: bool = False,
+    alone: bool = False,
+) -> FileSequence:
+    """As `open_sequence`; `alone` does not look for larger frames, so that folders may name each other."""
     folder = Path(path)
     if settings is None and folder.suffix == ".toml" and not folder.is_dir():
         folder, settings = folder.parent, folder
@@ -76,7 +88,7 @@ def open_sequence(
     if stated is not None and stated.buffers:
         own = convention(MotionConvention())
         sequence = PatternSequence(folder, settings=stated, motion=own, **also)
-        return _without_gaps(sequence) if strict else sequence
+        return _completed(sequence, stated, strict, alone)
     if stated is not None:
         also |= {"name": stated.name, "step": stated.step, "static_ids": stated.static_ids}
     if unreal_files(names):
@@ -86,7 +98,31 @@ def open_sequence(
     else:
         kinds = "<Scene><Buffer>.<0000>.exr, or color/ and motion/ with NNNN.png"
         raise InputError(f"{folder}: no frames found ({kinds}); describe its files in a {SETTINGS_NAME}")
+    return _completed(sequence, stated, strict, alone)
+
+
+def _completed(sequence: FileSequence, stated: Settings | None, strict: bool, alone: bool) -> FileSequence:
+    """The sequence with its cuts and its larger frames, as the folder's description states them."""
+    if stated is not None:
+        if unknown := [n for n in stated.cuts if n not in sequence.numbers]:
+            raise InputError(f"{stated.path}: cuts: there is no frame {unknown[0]}; name frames that are there")
+        sequence.cuts = stated.cuts
+        if stated.larger is not None and not alone:
+            sequence.larger = _larger(sequence, stated.path, stated.path.parent / stated.larger, strict)
     return _without_gaps(sequence) if strict else sequence
+
+
+def _larger(sequence: FileSequence, path: Path, folder: Path, strict: bool) -> Sequence:
+    found = _open(folder, strict=strict, alone=True)
+    (height, width), (high, wide) = sequence.size, found.size
+    if high % height or wide % width or high // height != wide // width or high == height:
+        text = f"expected frames a whole number of times as large as {width}x{height}, got {wide}x{high}"
+        raise InputError(f"{path}: larger: {text}; name another folder")
+    if missing := [n for n in sequence.numbers if n not in found.numbers]:
+        raise InputError(f"{path}: larger: {folder} has no frame {missing[0]}; render it")
+    if found.hdr != sequence.hdr:
+        raise InputError(f"{path}: larger: {folder} holds {'HDR' if found.hdr else '8-bit'} colour, the others do not")
+    return found
 
 
 def _without_gaps(sequence: FileSequence) -> FileSequence:
@@ -98,14 +134,14 @@ def _without_gaps(sequence: FileSequence) -> FileSequence:
 
 
 def runs(sequence: Sequence) -> tuple[range, ...]:
-    """The stretches of the numbering without a gap, in order; together they are all of `sequence.numbers`.
+    """The stretches of the numbering without a gap or a cut, in order; together they are all of `sequence.numbers`.
 
     A range has the sequence's step: `range(0, 6, 2)` is the frames 0, 2, 4. Neighbours are those next to each other in
     a run, `run[i]` and `run[i + 1]`; their numbers differ by the step.
     """
     out: list[range] = []
     for number in sequence.numbers:
-        if out and number == out[-1].stop:
+        if out and number == out[-1].stop and number not in sequence.cuts:
             out[-1] = range(out[-1].start, number + sequence.step, sequence.step)
         else:
             out.append(range(number, number + sequence.step, sequence.step))
@@ -115,7 +151,8 @@ def runs(sequence: Sequence) -> tuple[range, ...]:
 def gaps(sequence: Sequence) -> tuple[range, ...]:
     """The missing numbers between the first and the last frame, a range for each gap; a gap resets the history."""
     stretches = runs(sequence)
-    return tuple(range(a.stop, b.start, sequence.step) for a, b in itertools.pairwise(stretches))
+    between = (range(a.stop, b.start, sequence.step) for a, b in itertools.pairwise(stretches))
+    return tuple(gap for gap in between if gap)
 
 
 def around(sequence: Sequence, number: int, *, before: int = 0, behind: int = 0) -> tuple[int, ...]:

@@ -7,6 +7,7 @@ A full example, for a multi-layer render with PNG masks beside it:
     depth = "metric"                  # in the unit of position, or "ordinal": only larger = farther
     step = 1                          # from one frame's number to the next one's; by default it is found
     static_ids = [7, "9e3779b1"]      # ids of the stencil that do not move: walls that have an id, as they are stored
+    cuts = [2]                        # frames that begin another shot
 
     [motion]                          # how motion vectors are stated; what is left out: the library's convention
     sign = "current_minus_previous"   # or "previous_minus_current"
@@ -67,8 +68,11 @@ Flows are in the library's own convention, their third channel in the unit of po
 depth may have 0 for its nearest value, and less: it is moved to positive numbers in the same order, v + 1/256, and
 below 0 to 1 / (256 - 65536 v).
 
-For the other readers the same file may hold `[motion]`, `name`, `step` and `static_ids`; what `[motion]` leaves out
-keeps the reader's own default there.
+`larger = "../1080p"` names a folder of the same frames, 2, 3, ... times as large: the truth of methods that super
+sample.
+
+For the other readers the same file may hold `[motion]`, `name`, `step`, `static_ids`, `cuts` and `larger`; what
+`[motion]` leaves out keeps the reader's own default there.
 """
 
 import dataclasses
@@ -76,7 +80,7 @@ import os
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 
@@ -85,7 +89,7 @@ from jaxtrapolate.files.ids import StaticId, hexadecimal
 from jaxtrapolate.files.reader import BUFFERS
 from jaxtrapolate.files.sequence import MotionConvention
 from jaxtrapolate.files.text import BACKSLASH, read_toml
-from jaxtrapolate.records import Sign, Units, YAxis
+from jaxtrapolate.records import DepthKind, Sign, Units, YAxis
 
 SETTINGS_NAME = "jaxtrapolate.toml"
 """The name of the TOML file in a folder of frames."""
@@ -124,9 +128,11 @@ class Settings:
     motion: dict[str, str]
     name: str | None = None
     hdr: bool | None = None
-    depth: Literal["metric", "ordinal"] = "metric"
+    depth: DepthKind = "metric"
     step: int | None = None
     static_ids: tuple[StaticId, ...] = ()
+    cuts: tuple[int, ...] = ()
+    larger: str | None = None
 
     def convention(self, base: MotionConvention) -> MotionConvention:
         """`base` with what `[motion]` states."""
@@ -144,9 +150,11 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
     kinds = {
         "name": _text,
         "hdr": _flag,
-        "depth": _choice("metric", "ordinal"),
+        "depth": _choice(*get_args(DepthKind)),
         "step": _step,
         "static_ids": _static,
+        "cuts": _numbers,
+        "larger": _path_text,
         "motion": _table,
         "buffers": _table,
     }
@@ -234,6 +242,12 @@ def _static(value: Any) -> tuple[StaticId, ...]:
         except ValueError:
             raise ValueError(f"eight hexadecimal digits in each text, not {text!r}") from None
     return tuple(value)
+
+
+def _numbers(value: Any) -> tuple[int, ...]:
+    if not isinstance(value, list) or not all(isinstance(v, int) and not isinstance(v, bool) for v in value):
+        raise ValueError("a list of whole numbers, such as [12, 40]")
+    return tuple(sorted(set(value)))
 
 
 def _step(value: Any) -> int:

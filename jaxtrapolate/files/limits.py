@@ -36,7 +36,8 @@ def check_pixels(path: str | os.PathLike[str], height: int, width: int, channels
 
     Args:
         path: for the message.
-        height, width: as its header states them.
+        height: as its header states it.
+        width: as its header states it.
         channels: all that would be decoded.
     """
     if height < 1 or width < 1 or channels < 1:

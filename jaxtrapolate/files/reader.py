@@ -12,7 +12,7 @@ import weakref
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from jaxtrapolate.files.image import image_size
 from jaxtrapolate.files.listing import find_step
 from jaxtrapolate.files.repair import fill_nearest, no_depth, nonfinite_pixels, repair
 from jaxtrapolate.files.sequence import MotionConvention, Sequence
-from jaxtrapolate.records import CHANNELS, Frame, GBuffer, Keyframe
+from jaxtrapolate.records import CHANNELS, DepthKind, Frame, GBuffer, Keyframe
 
 BUFFERS: dict[str, int] = {"color": 3, "motion": 2, **CHANNELS, "forward_flow": 3, "backward_flow": 3}
 """The number of channels of every buffer that a file may hold."""
@@ -76,7 +76,7 @@ class FileSequence(Sequence):
         *,
         name: str,
         hdr: bool,
-        depth: Literal["metric", "ordinal"],
+        depth: DepthKind,
         convention: MotionConvention,
         step: int | None = None,
         static_ids: Iterable[StaticId] = (),

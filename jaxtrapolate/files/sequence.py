@@ -7,12 +7,12 @@ import abc
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from jaxtrapolate.errors import InputError
-from jaxtrapolate.records import Frame, Keyframe, Sign, Units, YAxis
+from jaxtrapolate.records import DepthOrAbsent, Frame, Keyframe, Sign, Units, YAxis
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +60,9 @@ class Sequence(abc.ABC):
             (scored in sRGB, written as PNG). `Frame.color` is linear either way.
         convention: how the stored motion vectors are stated; `frame` has converted them.
         depth: "metric" (in the unit of position), "ordinal" (larger = farther, and no more than that) or "absent".
+        cuts: numbers of frames that begin another shot: no motion leads from them to the frame before, and a method's
+            history and memory start anew.
+        larger: the same frames rendered larger, by a whole factor: what methods that super sample are compared with.
         forward_motion: whether `keyframe` gives flows to the next frame as well.
         notes: what the reader did that a user should know, one line each ("frame 0 left out: ..."); reading frames may
             add to it.
@@ -70,10 +73,17 @@ class Sequence(abc.ABC):
     size: tuple[int, int]
     hdr: bool
     convention: MotionConvention
-    depth: Literal["metric", "ordinal", "absent"]
+    depth: DepthOrAbsent
     step: int = 1
+    cuts: tuple[int, ...] = ()
+    larger: "Sequence | None" = None
     forward_motion: bool = False
     notes: tuple[str, ...] = ()
+
+    @property
+    def scale(self) -> int:
+        """How many times larger `larger` is in each direction, 1 where there is none."""
+        return 1 if self.larger is None else self.larger.size[0] // self.size[0]
 
     @abc.abstractmethod
     def frame(self, number: int) -> Frame:
@@ -93,7 +103,9 @@ class Sequence(abc.ABC):
         The name is part of it where there are no files.
         """
         read = {} if self.files(self.numbers[0]) else {"input": self.name}
-        return read | {"size": list(self.size), "hdr": self.hdr, "depth": self.depth, "motion": str(self.convention)}
+        read |= {"size": list(self.size), "hdr": self.hdr, "depth": self.depth, "motion": str(self.convention)}
+        read |= {"cuts": list(self.cuts)} if self.cuts else {}
+        return read if self.larger is None else read | {"larger": self.larger.identity()}
 
     def has_color(self, number: int) -> bool:
         """Whether the frame has colour, without reading it."""

@@ -1,9 +1,11 @@
 """Methods by name: `jaxtrapolate.load`."""
 
+import dataclasses
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from inspect import getdoc
 from os import PathLike
+from typing import Any
 
 from jaxtrapolate.methods import (
     bidirectional,
@@ -16,6 +18,7 @@ from jaxtrapolate.methods import (
     warping,
 )
 from jaxtrapolate.methods.method import Method as Method
+from jaxtrapolate.methods.method import Precision as Precision
 from jaxtrapolate.methods.method import Stage as Stage
 from jaxtrapolate.methods.method import neighbours as neighbours
 from jaxtrapolate.weights import default_weights
@@ -92,7 +95,9 @@ def _factory(name: str) -> Callable[..., Method]:
         raise ValueError(f"method {name!r} of the package {package} cannot be imported: {error}") from error
 
 
-def load(name: str, *, weights: str | PathLike[str] = "default") -> Method:
+def load(
+    name: str, *, weights: str | PathLike[str] = "default", dtype: Precision | None = None, **options: Any
+) -> Method:
     """A method by name.
 
     A package adds one by an entry point of the group "jaxtrapolate.methods": its name, and a function that returns a
@@ -102,6 +107,10 @@ def load(name: str, *, weights: str | PathLike[str] = "default") -> Method:
         name: one of `method_names()`.
         weights: for methods that have any: "default", those that come with the package; a file of weights of this
             library (`.npz`); an Orbax checkpoint (a folder); for "extranet" also the authors' `.pth.tar`.
+        dtype: "float32", "bfloat16" or "float16": what colours and buffers are cast to before the stages; the image is
+            in the dtype of the colours that were given. Motion, depth, position, stencil, cameras and times stay as
+            they are, and a network computes in the dtype of its weights. `None` = nothing is cast.
+        options: of the method, as `Method.options` lists them; see `Method.replace`.
 
     Returns:
         A `Method`: `image = method(history, target, future=())`.
@@ -109,8 +118,15 @@ def load(name: str, *, weights: str | PathLike[str] = "default") -> Method:
     Raises:
         OSError: the file of weights cannot be read.
         ValueError: an unknown name, weights for a method that has none, a method without default weights, or a file
-            that holds none of that method; a method of another package that cannot be imported or is none.
+            that holds none of that method; a method of another package that cannot be imported or is none; an option
+            that the method does not have, or of a wrong kind or out of range.
     """
+    method = _load(name, weights)
+    method = method if dtype is None else dataclasses.replace(method, dtype=dtype)
+    return method.replace(**options) if options else method
+
+
+def _load(name: str, weights: str | PathLike[str]) -> Method:
     if name in _METHODS:
         if weights != "default":
             raise ValueError(f"weights: method {name!r} has none, got {str(weights)!r}")

@@ -6,6 +6,7 @@ frame after, turned around, to that, and what is visible in both is blended. Wit
 """
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -13,21 +14,47 @@ from jaxtyping import Array
 from jaxtrapolate.bidirectional.assisted import DepthKind
 from jaxtrapolate.bidirectional.flows import complete_flows
 from jaxtrapolate.bidirectional.interpolate import interpolate_bidirectional
+from jaxtrapolate.bidirectional.options import Choice, SearchOptions, VisibilityOptions, VisibilityTest
+from jaxtrapolate.bidirectional.search import FlowFilter, Solver
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.between import BETWEEN, CHAINED, PAIR, depth_of
 from jaxtrapolate.methods.method import Method, Stage, Values, rendered, upcoming
-from jaxtrapolate.methods.stages import SKY, chain, find_holes
-from jaxtrapolate.methods.warping import fetch_guided, guides_of
+from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.stages import SKY, Demodulation, chain, find_holes, reflecting
+from jaxtrapolate.methods.warping import GuidedSettings, fetch_guided, guides_of
 from jaxtrapolate.ops.depth import apart as depth_apart
 from jaxtrapolate.ops.depth import held
 from jaxtrapolate.ops.motion import camera_motion
-from jaxtrapolate.ops.radiance import By, compress, demodulate, expand, modulate
+from jaxtrapolate.ops.radiance import compress, demodulate, expand, modulate
 from jaxtrapolate.ops.warp import backward_warp, in_frame, pixel_grid, sample
 from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Frame, Keyframe, replace
 
 _BLOCK = 8  # pixels, the side of the blocks over which differences are averaged
-_MARGIN = 2  # how much better the colour as it is must agree to make up half
+
+
+@settings
+class SearchSettings:
+    """Of the search for a pixel's point in both frames, as of `interpolate_bidirectional`."""
+
+    starts: tuple[str, ...] = option(("default", "dual"), "where searches start", choices=("default", "dual"))
+    iterations: int = option(3, "of each search", low=0, high=100)
+    solver: Solver = option("fixed_point", "how the flow's equation is solved", choices=Solver)
+    flow_filter: FlowFilter = option("nearest", "how flows are fetched between pixels", choices=FlowFilter)
+    choice: Choice = option(
+        "depth", "which of several solutions is taken: the nearest, or that of least error", choices=Choice
+    )
+    visibility: VisibilityTest = option(
+        "round_trip", "how it is told whether a point is seen in the other frame", choices=VisibilityTest
+    )
+    epsilon_error: float = option(0.5, "a search with a smaller error hits, in pixels", low=0)
+    epsilon_depth: float = option(0.05, "depths of one point differ by less, relatively", low=0)
+    epsilon_trip: float = option(1.0, "a round trip that ends nearer to its start is one, in pixels", low=0)
+
+
+@settings
+class AssistedSettings(SearchSettings, Demodulation):
+    """Of demodulation, and of the search where nothing was drawn of the target."""
 
 
 def depth_kind(*frames: Frame) -> DepthKind:
@@ -47,7 +74,19 @@ def _search(state, values: Values):
         depth=kind,
     )
     first, second = (replace(frame, color=compress(frame.color)) for frame in (flows.previous, flows.next))
-    made = interpolate_bidirectional(first, second, values["alpha"], depth=kind, visibility="round_trip").color
+    how = state.settings
+    search = SearchOptions(
+        starts=how.starts,
+        iterations=how.iterations,
+        solver=how.solver,
+        filter=how.flow_filter,
+        choice=how.choice,
+        epsilon=how.epsilon_error,
+    )
+    visible = VisibilityOptions(
+        test=how.visibility, depth=kind, epsilon_depth=how.epsilon_depth, epsilon_trip=how.epsilon_trip
+    )
+    made = interpolate_bidirectional(first, second, values["alpha"], search=search, visibility=visible).color
     return {"image": jnp.where(made == first.color, jnp.asarray(previous.color), expand(made))}
 
 
@@ -107,16 +146,18 @@ def _optional(stage: Stage) -> Stage:
     return dataclasses.replace(stage, optional=True)
 
 
-def _layers(frame: Frame, by: By | None) -> Array:
-    """What is reprojected `[H, W, 6]`: light, the colour over the reflectance, then the colour; without albedo that."""
-    color = check_present("color", frame.color, needed_by="bidirectional reprojection")
-    return color if by is None else jnp.concatenate([demodulate(color, frame.gbuffer, by=by), color], -1)
+def _layers(values: Values, how: Any) -> list[Array]:
+    """What is reprojected of both frames `[H, W, 6]`: light, the colour over the reflectance, then the colour.
 
-
-def _demodulates(values: Values, by: By) -> By | None:
-    """`by`, where all three frames have the albedo that it takes."""
-    frames = (values["previous"], values["target"], values["next"])
-    return by if all(f.gbuffer is not None and f.gbuffer.albedo is not None for f in frames) else None
+    The colour alone unless both and the target have albedo. how: a `Demodulation`.
+    """
+    frames = (values["previous"], values["next"])
+    colors = [check_present("color", frame.color, needed_by="bidirectional reprojection") for frame in frames]
+    if any(f.gbuffer is None or f.gbuffer.albedo is None for f in (*frames, values["target"])):
+        return colors
+    buffers = [reflecting(frame.gbuffer, how.sky) for frame in frames]
+    light = [demodulate(c, b, by=how.by, floor=how.floor) for c, b in zip(colors, buffers, strict=True)]
+    return [jnp.concatenate(pair, -1) for pair in zip(light, colors, strict=True)]
 
 
 def _weight(values: Values) -> Array:
@@ -142,37 +183,33 @@ _BOTH = (*REPROJECT_BOTH.reads, "history.depth", "future.depth")
 """What the blend of both frames by their depth takes."""
 
 
-def fetch_stage(by: By) -> Stage:
-    """Fetches both frames along the motion, bilinearly."""
-
-    def function(state, values: Values):
-        by_ = _demodulates(values, by)
-        pairs = (("previous", "to_previous"), ("next", "to_next"))
-        fetched = tuple(backward_warp(_layers(values[name], by_), values[motion]) for name, motion in pairs)
-        return {"fetched": fetched, "weight": _weight(values), "both": values["seen"][0] & values["seen"][1]}
-
-    return Stage("fetch", function, reads=_BOTH, optional=True)
+def _fetch(state, values: Values):
+    pairs = zip(_layers(values, state.settings), ("to_previous", "to_next"), strict=True)
+    fetched = tuple(backward_warp(layers, values[motion]) for layers, motion in pairs)
+    return {"fetched": fetched, "weight": _weight(values), "both": values["seen"][0] & values["seen"][1]}
 
 
-def guided_fetch_stage(by: By) -> Stage:
-    """Fetches both frames from the most similar pixels around where the motion leads, which need not be visible."""
+FETCH = Stage("fetch", _fetch, reads=_BOTH, optional=True)
+"""Fetches both frames along the motion, bilinearly."""
 
-    def function(state, values: Values):
-        by_ = _demodulates(values, by)
-        fetched, inside = [], []
-        motions = (values["to_previous"], values["to_next"])
-        for name, motion, seen in zip(("previous", "next"), motions, values["seen"], strict=True):
-            frame = values[name]
-            layers = fetch_guided(_layers(frame, by_), motion, ~seen, values["target"].gbuffer, frame.gbuffer)
-            color = backward_warp(check_present("color", frame.color, needed_by="guided fetch"), motion)
-            color = jnp.where(seen, color, layers[..., -3:])  # so that what stands still stays as it is
-            fetched.append(jnp.concatenate([layers[..., :-3], color], -1))
-            inside.append(in_frame(motion)[..., None])
-        one = inside[1].astype(values["alpha"].dtype)
-        weight = jnp.where(inside[0] == inside[1], values["alpha"], one)
-        return {"fetched": tuple(fetched), "weight": weight, "both": inside[0] & inside[1]}
 
-    return Stage("guided fetch", function, reads=(guides_of("history"), guides_of("future")))
+def _guided_fetch(state, values: Values):
+    fetched, inside = [], []
+    frames, motions = (values["previous"], values["next"]), (values["to_previous"], values["to_next"])
+    both = zip(frames, _layers(values, state.settings), motions, values["seen"], strict=True)
+    for frame, given, motion, seen in both:
+        layers = fetch_guided(given, motion, ~seen, values["target"].gbuffer, frame.gbuffer, state.settings)
+        color = backward_warp(given[..., -3:], motion)
+        color = jnp.where(seen, color, layers[..., -3:])  # so that what stands still stays as it is
+        fetched.append(jnp.concatenate([layers[..., :-3], color], -1))
+        inside.append(in_frame(motion)[..., None])
+    one = inside[1].astype(values["alpha"].dtype)
+    weight = jnp.where(inside[0] == inside[1], values["alpha"], one)
+    return {"fetched": tuple(fetched), "weight": weight, "both": inside[0] & inside[1]}
+
+
+GUIDED_FETCH = Stage("guided fetch", _guided_fetch, reads=(guides_of("history"), guides_of("future")))
+"""Fetches both frames from the most similar pixels around where the motion leads, which need not be visible."""
 
 
 def _blend(state, values: Values):
@@ -199,7 +236,7 @@ def _apart(first: Array, second: Array, both: Array) -> Array:
     return _blocks(jnp.where(both, jnp.square(compress(first) - compress(second)), 0)) ** 2
 
 
-def relight_stage(by: By, *, reads: tuple[str, ...] = ()) -> Stage:
+def relight_stage(*, reads: tuple[str, ...] = ()) -> Stage:
     """Blends light instead of colour: over each frame's reflectance, times the target's.
 
     Where light is not reflectance times irradiance (emission, fog) that prints a texture which is not there. There the
@@ -207,14 +244,15 @@ def relight_stage(by: By, *, reads: tuple[str, ...] = ()) -> Stage:
     and so do pixels that stand still.
 
     Args:
-        by: as of `demodulate`.
         reads: of the stages before it, where those are optional.
     """
 
     def function(state, values: Values):
-        (first, second), weight, both = values["fetched"], values["weight"], values["both"]
-        light = [modulate(layers[..., :3], values["target"].gbuffer, by=by) for layers in (first, second)]
-        a, b = _apart(first[..., 3:], second[..., 3:], both) * _MARGIN**2, _apart(light[0], light[1], both)
+        (first, second), weight, both, how = values["fetched"], values["weight"], values["both"], state.settings
+        buffers = reflecting(values["target"].gbuffer, how.sky)
+        light = [modulate(layers[..., :3], buffers, by=how.by, floor=how.floor) for layers in (first, second)]
+        a, b = _apart(first[..., 3:], second[..., 3:], both), _apart(light[0], light[1], both)
+        a = a * jnp.square(jnp.asarray(how.margin, a.dtype))
         relit = jnp.where(a + b > 0, a / jnp.where(a + b > 0, a + b, 1), 1)
         height, width = both.shape[:2]
         x, y = pixel_grid(height, width, relit.dtype)
@@ -230,24 +268,25 @@ def relight_stage(by: By, *, reads: tuple[str, ...] = ()) -> Stage:
     return Stage("relight", function, reads=reads, optional=True)
 
 
-def bidirectional(*, by: By = "albedo+specular") -> Method:
+def bidirectional() -> Method:
     """Both rendered frames around the target, by the target's own motion and buffers where those were drawn."""
     blend = dataclasses.replace(BLEND, reads=_BOTH, optional=True)
-    both = (_optional(REPROJECT_BOTH), fetch_stage(by), blend, relight_stage(by, reads=_BOTH))
+    both = (_optional(REPROJECT_BOTH), FETCH, blend, relight_stage(reads=_BOTH))
     stages = (PAIR, BETWEEN, *both, SEARCH, SKY)
-    return Method("bidirectional", stages, kind="interpolation", past=1, future=1)
+    return Method("bidirectional", stages, kind="interpolation", future=1, settings=AssistedSettings())
 
 
 def bidirectional_image() -> Method:
     """Both rendered frames around the target, from their own buffers alone."""
-    return Method("bidirectional_image", (PAIR, BETWEEN, SEARCH), kind="interpolation", past=1, future=1)
+    stages = (PAIR, BETWEEN, SEARCH)
+    return Method("bidirectional_image", stages, kind="interpolation", future=1, settings=SearchSettings())
 
 
-def bidirectional_guided(*, by: By = "albedo+specular") -> Method:
+def bidirectional_guided() -> Method:
     """As "bidirectional", each frame fetched by the guided warp (ExtraSS, section 4.2), and always both blended.
 
     Ours. The guided warp finds like surfaces beside a hole, so that a frame in which the point is hidden still says
     something of its light.
     """
-    stages = (PAIR, BETWEEN, REPROJECT_BOTH, guided_fetch_stage(by), BLEND, relight_stage(by), SKY)
-    return Method("bidirectional_guided", stages, kind="interpolation", past=1, future=1)
+    stages = (PAIR, BETWEEN, REPROJECT_BOTH, GUIDED_FETCH, BLEND, relight_stage(), SKY)
+    return Method("bidirectional_guided", stages, kind="interpolation", future=1, settings=GuidedSettings())

@@ -6,13 +6,19 @@ from jaxtyping import Array, Float
 from jaxtrapolate.bidirectional.assisted import blend as mix
 from jaxtrapolate.methods.between import BETWEEN, FLOWS, PAIR, depth_of
 from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.ops.fill import fill_pyramid
 from jaxtrapolate.ops.radiance import tonemap
 from jaxtrapolate.ops.scatter import splat
 from jaxtrapolate.ops.warp import backward_warp
 
-_BY_DEPTH = 5.0  # exponents at infinite depth; this and the next by mean dB on embedded scenes
-_BY_COLOR = 10.0  # exponents per difference of display values; the authors' release starts from 20
+
+@settings
+class SoftmaxSettings:
+    """Of the exponents, by mean dB on embedded scenes; that of colour starts from 20 in the authors' release."""
+
+    by_depth: float = option(5.0, "how much the nearer pixel prevails: exponents at infinite depth", low=0)
+    by_color: float = option(10.0, "the same by colour, where there is no depth: per display value", low=0)
 
 
 def evenly(alpha: Array, image: Array) -> Float[Array, "h w 1"]:
@@ -48,31 +54,31 @@ def half_motion() -> Method:
     return Method("half_motion", (PAIR, BETWEEN, Stage("fetch", function)), kind="interpolation", future=1)
 
 
-def _nearness(depth: Array) -> Float[Array, "h w 1"]:
-    """Exponents by depth of any unit: -5 depth / (depth + its harmonic mean over the frame); -5 where nothing is.
+def _nearness(depth: Array, scale: float | Array) -> Float[Array, "h w 1"]:
+    """Exponents by depth of any unit: -scale depth / (depth + its harmonic mean over the frame); -scale at nothing.
 
     In that mean what is far hardly counts, and nothing counts as the limit of that. NaN counts as nothing.
     """
     known = depth < jnp.inf
     inverse = jnp.where(known, 1 / jnp.where(known, depth, 1), 0)
     mean = jnp.mean(inverse)
-    return -_BY_DEPTH * jnp.where(mean > 0, mean / jnp.where(mean > 0, inverse + mean, 1), 1)
+    return -jnp.asarray(scale, depth.dtype) * jnp.where(mean > 0, mean / jnp.where(mean > 0, inverse + mean, 1), 1)
 
 
-def _likeness(own: Array, other: Array, flow: Array) -> Float[Array, "h w 1"]:
-    """Exponents by colour: -20 times the mean difference of display values from where the flow leads."""
+def _likeness(own: Array, other: Array, flow: Array, scale: float | Array) -> Float[Array, "h w 1"]:
+    """Exponents by colour: -scale times the mean difference of display values from where the flow leads."""
     apart = jnp.abs(tonemap(own) - tonemap(backward_warp(other, flow)))
     apart = jnp.mean(apart, -1, keepdims=True)
-    return -_BY_COLOR * jnp.where(jnp.isfinite(apart), apart, 0)
+    return -jnp.asarray(scale, apart.dtype) * jnp.where(jnp.isfinite(apart), apart, 0)
 
 
 def softmax_splat() -> Method:
     """Both frames splatted along their flows to the target, softmax where several pixels land, and mixed by time.
 
-    The exponents are -100 z / (z + mean z), z the depth, which needs no unit; where a frame has no depth, -20 times the
-    photometric error of its flow (on tone-mapped colours, mean over channels). Mixing weighs each side by time and by
-    its coverage (the sum of shares that landed, at most 1), so that what one side leaves open the other fills; what
-    both leave open is filled by `fill_pyramid`.
+    The exponents are -by_depth z / (z + mean z), z the depth, which needs no unit; where a frame has no depth,
+    -by_color times the photometric error of its flow (on tone-mapped colours, mean over channels). Mixing weighs each
+    side by time and by its coverage (the sum of shares that landed, at most 1), so that what one side leaves open the
+    other fills; what both leave open is filled by `fill_pyramid`.
 
     References: Niklaus and Liu 2020. Departures: no network makes the flows or mixes the warped frames: the flows are
     the engine's, the forward one made from the backward one; depth instead of, or with, brightness constancy.
@@ -80,13 +86,14 @@ def softmax_splat() -> Method:
 
     def importance(state, values: Values):
         previous, next = values["previous"], values["next"]
-        first, second = depth_of(previous), depth_of(next)
-        return {
-            "exponents": (
-                _likeness(previous.color, next.color, values["forward"]) if first is None else _nearness(first),
-                _likeness(next.color, previous.color, values["backward"]) if second is None else _nearness(second),
-            )
-        }
+        exponents, how = [], state.settings
+        for own, other, flow in ((previous, next, "forward"), (next, previous, "backward")):
+            depth = depth_of(own)
+            if depth is None:
+                exponents.append(_likeness(own.color, other.color, values[flow], how.by_color))
+            else:
+                exponents.append(_nearness(depth, how.by_depth))
+        return {"exponents": tuple(exponents)}
 
     def function(state, values: Values):
         alpha = values["alpha"]
@@ -109,4 +116,4 @@ def softmax_splat() -> Method:
         return {"image": fill_pyramid(values["mixed"], values["covered"])}
 
     stages = (PAIR, BETWEEN, FLOWS, Stage("exponents", importance), Stage("splat", function), Stage("fill", fill))
-    return Method("softmax_splat", stages, kind="interpolation", future=1)
+    return Method("softmax_splat", stages, kind="interpolation", future=1, settings=SoftmaxSettings())

@@ -23,13 +23,13 @@ from jaxtrapolate.methods.stages import (
     SKY,
     composite,
     demodulate_stage,
-    demodulated,
     holes_stage,
     layers,
     modulate_stage,
+    reflecting,
     reproject_stage,
 )
-from jaxtrapolate.methods.warping import guided_stage
+from jaxtrapolate.methods.warping import GUIDED, Guide
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig, extranet_from_torch
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.networks.stored import load_network
@@ -165,7 +165,7 @@ def encoded_truth(
         TypeError, ValueError: no floating-point array, or a size that differs.
     """
     if buffers is not None and buffers.albedo is not None:
-        color = demodulate(color, demodulated(buffers, preparation.sky), by=preparation.by, floor=preparation.floor)
+        color = demodulate(color, reflecting(buffers, preparation.sky), by=preparation.by, floor=preparation.floor)
     return encode(color)
 
 
@@ -196,7 +196,8 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
     features `[H, W, 6]` and history `[3, H, W, 4]`, oldest first, all in the log domain: these are `values["inputs"]`
     of the stages before "network". Its answer is decoded and modulated. The sky is the engine's where it draws it
     apart, else that of the newest frame, warped as the first guess is. Where nothing moves and all rendered frames are
-    equal, in the whole frame, the newest is the result.
+    equal, in the whole frame, the newest is the result. Its options are those of the guided warp, where that makes the
+    first guess; all else that could be set was set when the network was trained.
 
     What a scene lacks is left out: no albedo, no demodulation; no depth, no occlusion motion, the composite is the
     warp; normal, depth, roughness or metallic that are absent are zeros; masks are those that the buffers allow.
@@ -215,8 +216,8 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
     config = model.config
     if config.features not in (0, 6) or not 1 <= config.warps <= 2:
         raise ValueError(f"model: expected 6 features or none and 1 or 2 warped images, got {config}")
-    function, state = inference(model)
-    guided = (dataclasses.replace(guided_stage(), optional=True),) if preparation.first_guess == "guided" else ()
+    function, weights = inference(model)
+    guided = (dataclasses.replace(GUIDED, optional=True),) if preparation.first_guess == "guided" else ()
 
     def warp(state, values: Values):
         pairs = zip(layers(values), values["motions"], strict=True)
@@ -225,7 +226,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
 
     def network(state, values: Values):
         inputs = values["inputs"]
-        image = log_decode(function(state, *(inputs[name] for name in ("x", "mask", "features", "history"))))
+        image = log_decode(function(state.weights, *(inputs[name] for name in ("x", "mask", "features", "history"))))
         history, motions = values["history"], values["motions"]
         if len(motions) > 1:  # with one rendered frame it is not known whether anything changes
             colors = [history[i].color for i in rendered(history)][: len(motions)]
@@ -240,22 +241,22 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
         plain = values["guess"] if guided and preparation.sky else composite(values, values["newest"].color)
         return {"image": jnp.where(values["target"].gbuffer.sky > 0.5, plain.astype(image.dtype), image)}
 
-    demodulation: dict[str, Any] = {"floor": preparation.floor, "sky": preparation.sky}
     past = max(1, config.histories)
     stages = (
         reproject_stage(past),
         dataclasses.replace(OCCLUSION, optional=True),
         holes_stage(preparation.taps, position_threshold=preparation.position_threshold),
-        demodulate_stage(preparation.by, **demodulation),
+        demodulate_stage(preparation),
         Stage("warp", warp),
         *guided,
         _inputs_stage(config, preparation),
         Stage("network", network),
-        modulate_stage(preparation.by, **demodulation),
+        modulate_stage(preparation),
         Stage("warped sky", sky, reads=("target.sky",), optional=True),
         SKY,
     )
-    return Method(_NAME, stages, past=past, state=state, networks={"network": function})
+    given = Guide() if guided else ()
+    return Method(_NAME, stages, past=past, weights=weights, settings=given, networks={"network": function})
 
 
 def load_extranet(path: str | PathLike[str]) -> tuple[ExtraNet, Preparation]:

@@ -5,11 +5,18 @@ The papers' warps go forward from one frame; see `jaxtrapolate.ops.grid.grid_war
 
 from jaxtrapolate.methods.between import BETWEEN, FLOWS, PAIR, depth_of
 from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.reprojection import CAMERA, LINEAR, NEWEST, ONWARD_NEEDS, carried_depth
 from jaxtrapolate.ops.fill import fill_pyramid
 from jaxtrapolate.ops.grid import grid_warp as warp_grid
 
-_CELL = 4  # pixels: stands for the refinement near silhouettes, which a uniform grid has not
+
+@settings
+class GridSettings:
+    """Of the grid; small cells stand for the refinement near silhouettes, which a uniform grid has not."""
+
+    cell: int = option(4, "the width of a cell in pixels", low=1, high=256)
+    tear: float = option(2.0, "a cell is torn where an edge gets longer by this factor", low=1, high=1e6)
 
 
 def _fill(state, values: Values):
@@ -31,11 +38,11 @@ def grid_warp() -> Method:
     def function(state, values: Values):
         previous = values["previous"]
         moved = values["forward"], depth_of(previous), values["alpha"]
-        warped, covered = warp_grid(previous.color, *moved, cell=_CELL)
+        warped, covered = warp_grid(previous.color, *moved, cell=state.settings.cell, tear=state.settings.tear)
         return {"warped": warped, "covered": covered}
 
     stages = (PAIR, BETWEEN, FLOWS, Stage("grid warp", function), _FILL)
-    return Method("grid_warp", stages, kind="interpolation", future=1)
+    return Method("grid_warp", stages, kind="interpolation", future=1, settings=GridSettings())
 
 
 def grid_extrapolate() -> Method:
@@ -46,8 +53,10 @@ def grid_extrapolate() -> Method:
 
     def function(state, values: Values):
         depth = None if depth_of(values["newest"]) is None else carried_depth(values)
-        warped, covered = warp_grid(values["newest"].color, values["onward"], depth, 1.0, cell=_CELL)
+        warped, covered = warp_grid(
+            values["newest"].color, values["onward"], depth, 1.0, cell=state.settings.cell, tear=state.settings.tear
+        )
         return {"warped": warped, "covered": covered}
 
     stages = (NEWEST, LINEAR, CAMERA, Stage("grid warp", function, reads=ONWARD_NEEDS), _FILL)
-    return Method("grid_extrapolate", stages)
+    return Method("grid_extrapolate", stages, settings=GridSettings())

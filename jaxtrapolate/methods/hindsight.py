@@ -15,13 +15,12 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.method import Stage, Values, rendered
-from jaxtrapolate.methods.stages import chain
+from jaxtrapolate.methods.stages import chain, reflecting
 from jaxtrapolate.ops.radiance import By, compress, demodulate, modulate
 from jaxtrapolate.ops.warp import backward_warp, landing, sample
-from jaxtrapolate.records import Frame
+from jaxtrapolate.records import Frame, replace
 
 _BLOCK = 8  # pixels, the side of the blocks over which errors are averaged
-_MARGIN = 2  # the plain prediction must be better by this factor of the squared error to make up half
 
 
 def _blocks(image: Float[Array, "h w 1"]) -> Float[Array, "i j 1"]:
@@ -38,37 +37,56 @@ def _blocks(image: Float[Array, "h w 1"]) -> Float[Array, "i j 1"]:
 
 
 @partial(jax.jit, static_argnames=("by",))
-def plain_share(newest: Frame, previous: Frame, motion: Float[Array, "h w 2"], *, by: By) -> Float[Array, "i j 1"]:
+def plain_share(
+    newest: Frame,
+    previous: Frame,
+    motion: Float[Array, "h w 2"],
+    *,
+    by: By,
+    floor: float | Float[Array, ""] = 1e-2,
+    margin: float | Float[Array, ""] = 2.0,
+) -> Float[Array, "i j 1"]:
     """How much of a prediction should come from the colour as it is, 0..1, for each block of 8 x 8 pixels of `newest`.
 
     The squared errors of both predictions of `newest` from `previous`, tone mapped and summed over a block, say which
-    was better: share = b^2 / ((2 a)^2 + b^2), a the plain one's and b the demodulated one's; 1 where neither errs, so
-    that what stands still stays as it is. The margin of 2 is for what the methods add to demodulation: on 36 windows of
-    embedded scenes the guided warp has 36.63 dB with it, 36.56 with 1 and 36.61 without hindsight (most of that on
+    was better: share = b^2 / ((margin a)^2 + b^2), a the plain one's and b the demodulated one's; 1 where neither errs,
+    so that what stands still stays as it is. The margin of 2 is for what the methods add to demodulation: on 36 windows
+    of embedded scenes the guided warp has 36.63 dB with it, 36.56 with 1 and 36.61 without hindsight (most of that on
     street, at night: 31.26 and 31.00); the occlusion warp has 33.49 with it and 33.62 with 1.
+
+    Args:
+        newest, previous: rendered frames with albedo. motion: from the newest to the previous one.
+        by, floor: as of `demodulate`. margin: at least 0.
     """
     truth = compress(check_present("newest.color", newest.color, needed_by="plain_share"))
     color = check_present("previous.color", previous.color, needed_by="plain_share")
     plain = backward_warp(color, motion)
-    demodulated = backward_warp(demodulate(color, previous.gbuffer, by=by), motion)
+    divided = backward_warp(demodulate(color, previous.gbuffer, by=by, floor=floor), motion)
 
     def error(image):
         difference = jnp.square(compress(image) - truth)
         return _blocks(difference[..., :1] + difference[..., 1:2] + difference[..., 2:]) ** 2
 
-    a, b = error(plain) * _MARGIN**2, error(modulate(demodulated, newest.gbuffer, by=by))
+    a, b = error(plain), error(modulate(divided, newest.gbuffer, by=by, floor=floor))
+    a = a * jnp.square(jnp.asarray(margin, a.dtype))
     return jnp.where(a + b > 0, b / jnp.where(a + b > 0, a + b, 1), 1)
 
 
-def hindsight_stage(by: By = "albedo+specular") -> Stage:
-    """Adds "plain_share", carried along the motion to the target's grid."""
+def _hindsight(state, values: Values):
+    history, motion, how = values["history"], values["motion"], state.settings
+    newest, previous = rendered(history)[:2]
+    frames = (replace(history[i], gbuffer=reflecting(history[i].gbuffer, how.sky)) for i in (newest, previous))
+    between = chain(history, newest, previous)
+    share = plain_share(*frames, between, by=how.by, floor=how.floor, margin=how.margin)
+    x, y, _ = landing(motion)
+    return {"plain_share": sample(share, (x + 0.5) / _BLOCK - 0.5, (y + 0.5) / _BLOCK - 0.5)}
 
-    def function(state, values: Values):
-        history, motion = values["history"], values["motion"]
-        newest, previous = rendered(history)[:2]
-        share = plain_share(history[newest], history[previous], chain(history, newest, previous), by=by)
-        x, y, _ = landing(motion)
-        return {"plain_share": sample(share, (x + 0.5) / _BLOCK - 0.5, (y + 0.5) / _BLOCK - 0.5)}
 
-    reads = ("history.albedo", "target.albedo", "newest.motion", "before_newest.motion")
-    return Stage("hindsight", function, reads=reads, optional=True, past=2)
+HINDSIGHT = Stage(
+    "hindsight",
+    _hindsight,
+    reads=("history.albedo", "target.albedo", "newest.motion", "before_newest.motion"),
+    optional=True,
+    past=2,
+)
+"""Adds "plain_share", carried along the motion to the target's grid."""

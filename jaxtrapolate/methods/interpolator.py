@@ -28,17 +28,17 @@ def interpolator(model: Interpolator) -> Method:
 
     References: of the kind of Kong et al. 2022 (IFRNet), see `jaxtrapolate.networks.interpolator` for what differs.
     """
-    function, state = inference(model)
+    function, weights = inference(model)
 
     def inputs(state, values: Values):
         first, second = (compress(values[name].color) for name in ("previous", "next"))
         return {"inputs": (first, second, values["alpha"].astype(first.dtype))}
 
     def network(state, values: Values):
-        return {"image": expand(function(state, *values["inputs"]))}
+        return {"image": expand(function(state.weights, *values["inputs"]))}
 
     stages = (PAIR, Stage("inputs", inputs), Stage("network", network))
-    return Method(_NAME, stages, kind="interpolation", future=1, state=state, networks={"network": function})
+    return Method(_NAME, stages, kind="interpolation", future=1, weights=weights, networks={"network": function})
 
 
 def interpolator_config(config: InterpolatorConfig) -> dict[str, Any]:

@@ -1,28 +1,44 @@
 """What a method is: a list of named stages over one set of values.
 
 The run, the benchmark, the plan and the reports all read that one list. A stage is a pure function of the method's
-state (its weights) and of the values so far, a dict; it returns the values that it adds. A method starts with "carry",
-"history", "target" and "future", frames whose depth is +inf where no surface was hit, and ends with "image". A stage on
-the host (a library that is not JAX) is run between the compiled ones around it.
+state (its weights and options) and of the values so far, a dict; it returns the values that it adds. A method starts
+with "carry", "history", "target" and "future", frames whose depth is +inf where no surface was hit, and ends with
+"image". A target with colour is a rendered frame: its stages start with that as "image". A stage with memory returns a
+new "carry". A stage on the host (a library that is not JAX) is run between the compiled ones around it.
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from itertools import groupby, pairwise
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxtrapolate.checks import missing_package
+from jaxtrapolate.checks import check_choice, missing_package
+from jaxtrapolate.methods.options import Option, options_of, replaced
 from jaxtrapolate.ops.depth import surfaces
-from jaxtrapolate.records import Frame, check_frame
+from jaxtrapolate.ops.jitter import on_own_pixels
+from jaxtrapolate.records import Frame, check_frame, record
+from jaxtrapolate.records import replace as exchange
 
 Values = Mapping[str, Any]
 Frames = tuple[Frame, ...]
+
+Precision = Literal["float32", "bfloat16", "float16"]
+"""What a method may work in, whatever its frames are in."""
+
+
+@record
+@dataclasses.dataclass(frozen=True)
+class State:
+    """What a stage is given beside the values: a method's weights, and its options as `settings`."""
+
+    weights: Any = ()
+    settings: Any = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +55,8 @@ class Stage:
             that and the rendered one before it, and "before_next", in future before the next rendered frame.
         optional: whether the method does without it: left out where a buffer is missing. Without a stage that is not
             optional the method cannot run.
-        past: how many rendered frames it needs.
+        past: how many rendered frames it needs in history; 0 where its target or the carry is enough.
+        on: the targets that it runs on: those that are generated (without colour), the rendered ones, or both.
         host: whether its function is no JAX code: it gets arrays and is never traced.
         extra: the optional dependency that it needs, as in `pip install "jaxtrapolate[extra]"`.
     """
@@ -49,15 +66,28 @@ class Stage:
     reads: tuple[str, ...] = ()
     optional: bool = False
     past: int = 1
+    on: Literal["generated", "rendered", "both"] = "generated"
     host: bool = False
     extra: str | None = None
 
 
 def buffer(frame: Frame, name: str) -> Any:
-    """What a frame has by name, or `None`: colour, motion, camera, jitter, time, or a buffer of its `GBuffer`."""
-    if name in ("color", "motion", "camera", "jitter", "time"):
+    """What a frame has by name, or `None`: one of its own fields, or a buffer of its `GBuffer`."""
+    if name in ("color", "motion", "camera", "jitter", "time", "objects"):
         return getattr(frame, name)
     return None if frame.gbuffer is None else getattr(frame.gbuffer, name)
+
+
+_KEPT = ("depth", "position", "stencil")
+
+
+def cast(frame: Frame, dtype: Any) -> Frame:
+    """A frame whose colour and buffers are of a dtype, but for depth, position and stencil, which need their digits."""
+    buffers, given = frame.gbuffer, None
+    if buffers is not None:
+        there = {f.name: getattr(buffers, f.name) for f in dataclasses.fields(buffers) if f.name not in _KEPT}
+        given = exchange(buffers, **{n: jnp.asarray(v, dtype) for n, v in there.items() if v is not None})
+    return exchange(frame, color=None if frame.color is None else jnp.asarray(frame.color, dtype), gbuffer=given)
 
 
 def rendered(history: Sequence[Frame]) -> list[int]:
@@ -136,7 +166,8 @@ class Method:
 
     history and future are tuples of `Frame` in order of display, oldest first; a frame may lack colour (only its
     buffers were drawn): motion chains through it. target is the `Frame` to be made: its time, and whatever buffers were
-    drawn for it. A target that has colour was rendered, and is returned as it is by methods that do not super sample.
+    drawn for it. A target that has colour was rendered; a method has stages for those if it super samples or remembers,
+    and returns them as they are if it has none.
 
     No frame may be left out between those handed over: each one's motion leads to the one before it here, also from
     future[0] to the target (to history[-1] where the target has no motion), and from the target to history[-1]. Of a
@@ -151,9 +182,13 @@ class Method:
         kind: "extrapolation" uses the past only, "interpolation" the future too.
         past, future: how many rendered frames it takes at most; with fewer it leaves out what needs them.
         scale: output size over input size.
-        state: a pytree, the weights.
-        networks: the networks on their own, by name: pure functions `(state, *inputs) -> output` of one frame.
-        start: `(history, target) -> carry`, for methods with memory.
+        weights: a pytree.
+        settings: its options, an instance of a class that `jaxtrapolate.methods.options.settings` decorates.
+        dtype: what the stages work in: colours and buffers are cast to it, and the image to what the colours were in.
+            Motion, depth, position, stencil, cameras and times stay as they are. `None` = nothing is cast.
+        networks: the networks on their own, by name: pure functions `(weights, *inputs) -> output` of one frame.
+        start: `(history, target) -> carry`, for methods with memory: these are to be given every frame in order of
+            display, the rendered ones too.
     """
 
     name: str
@@ -162,22 +197,61 @@ class Method:
     past: int = 1
     future: int = 0
     scale: int = 1
-    state: Any = ()
+    weights: Any = ()
+    settings: Any = ()
+    dtype: Precision | None = None
     networks: Mapping[str, Callable[..., Any]] = dataclasses.field(default_factory=dict)
     start: Callable[[Frames, Frame], Any] | None = None
 
+    def __post_init__(self):
+        if self.dtype is not None:
+            check_choice("dtype", self.dtype, get_args(Precision))
+        if self.scale != 1 and not any(stage.on != "generated" for stage in self.stages):
+            raise ValueError(f"method {self.name!r}: expected stages that super sample rendered frames too, got none")
+
+    @property
+    def state(self) -> State:
+        """What `function` is given: the weights and the options. Its real-valued options are leaves of this pytree."""
+        return State(self.weights, self.settings)
+
+    @property
+    def options(self) -> tuple[Option, ...]:
+        """Its options: name, default, current value, range or choices, whether static, and what they do."""
+        return options_of(self.settings)
+
+    def replace(self, **options: Any) -> "Method":
+        """This method with other options; real-valued ones change without compiling anew.
+
+        Raises:
+            ValueError: an unknown option, or a value of another kind or out of range; lists the options.
+        """
+        changed = dataclasses.replace(self, settings=replaced(f"method {self.name!r}", self.settings, options))
+        for name in ("_jitted", "_first_values", "_compiled_rows", "jitted_stages"):  # none of them holds the settings
+            changed.__dict__[name] = getattr(self, name)
+        return changed
+
+    @property
+    def memory(self) -> bool:
+        """Whether it has a carry, so that it is to be given every frame in order of display, the rendered ones too."""
+        return self.start is not None
+
+    def _on(self, target: Frame) -> tuple[Stage, ...]:
+        """The stages for a target as it is, rendered or to be generated."""
+        kind = "generated" if target.color is None else "rendered"
+        return tuple(stage for stage in self.stages if stage.on in (kind, "both"))
+
     def missing(self, history: Frames, target: Frame, future: Frames = ()) -> dict[str, list[str]]:
-        """What each stage that cannot run lacks: `{stage: [buffers]}`; of all stages, optional or not."""
-        return {s.name: lacks for s in self.stages if (lacks := self._lacks(s, history, target, future))}
+        """What each stage that cannot run lacks: `{stage: [buffers]}`; of all for such a target, optional or not."""
+        return {s.name: lacks for s in self._on(target) if (lacks := self._lacks(s, history, target, future))}
 
     def active(self, history: Frames, target: Frame, future: Frames = ()) -> tuple[Stage, ...]:
-        """The stages that run on frames like these.
+        """The stages that run on frames like these; none where a rendered target is returned as it is.
 
         Raises:
             ValueError: a stage that the method cannot do without lacks something, named in the message.
         """
         stages = []
-        for stage in self.stages:
+        for stage in self._on(target):
             lacks = self._lacks(stage, history, target, future)
             if not lacks:
                 stages.append(stage)
@@ -219,13 +293,11 @@ class Method:
 
         Raises:
             TypeError: traced, in a method with a stage on the host: there is no such function of it.
-            ValueError: see `active`; frames whose sizes differ, or a history without colour.
+            ValueError: see `active`; frames whose sizes differ, or for a target without colour a history without.
         """
         self._check(history, target, future)
-        if target.color is not None and self.scale == 1:
-            return carry, jnp.asarray(target.color)
         values = self._advance(self.active(history, target, future), state, carry, history, target, future)
-        return values["carry"], values["image"]
+        return values["carry"], self._answer(values["image"], history, target)
 
     def values_before(
         self, stage: str, state: Any, carry: Any, history: Frames, target: Frame, future: Frames = ()
@@ -233,7 +305,6 @@ class Method:
         """The values that a stage gets: what the stages before it have made, as a pure function like `function`.
 
         Training runs a network's inputs through it, under vmap and jit: `values_before("network", ...)["inputs"]`.
-        The target's colour is not looked at.
 
         Raises:
             TypeError, ValueError: as `function`; no stage of that name, or one that these frames leave out.
@@ -246,9 +317,29 @@ class Method:
         return self._advance(stages[: names.index(stage)], state, carry, history, target, future)
 
     def first_values(self, carry: Any, history: Frames, target: Frame, future: Frames = ()) -> dict[str, Any]:
-        """What the first stage gets: the frames, whose depth is +inf where no surface was hit (`surface_depth`)."""
-        history, future = (tuple(map(surfaces, frames)) for frames in (history, future))
-        return {"carry": carry, "history": history, "target": surfaces(target), "future": future}
+        """What the first stage gets.
+
+        The frames, whose depth is +inf where no surface was hit (`surface_depth`), and whose motion and cameras lead to
+        pixels where frames are jittered (`jaxtrapolate.ops.jitter`).
+        """
+        before = target if target.motion is not None or not history else history[-1]
+        future = on_own_pixels((before, *future))[1:]
+        frames = on_own_pixels((*history, target))
+        history, target = frames[:-1], frames[-1]
+        given, past, coming = (tuple(map(self._prepared, frames)) for frames in ((target,), history, future))
+        values = {"carry": carry, "history": past, "target": given[0], "future": coming}
+        return values if target.color is None or self.scale != 1 else values | {"image": jnp.asarray(target.color)}
+
+    def _prepared(self, frame: Frame) -> Frame:
+        frame = surfaces(frame)
+        return frame if self.dtype is None else cast(frame, jnp.dtype(self.dtype))
+
+    def _answer(self, image: Array, history: Frames, target: Frame) -> Array:
+        """The image in the dtype that the colours had."""
+        if self.dtype is None:
+            return image
+        color = history[rendered(history)[0]].color if target.color is None else target.color
+        return image.astype(color.dtype)  # type: ignore[union-attr]
 
     def _advance(self, stages, state, carry, history, target, future) -> dict[str, Any]:
         values = self.first_values(carry, history, target, future)
@@ -264,13 +355,11 @@ class Method:
     def _by_turns(self, carry, history, target, future):
         """As `function`, each row of stages between those on the host compiled as one."""
         self._check(history, target, future)
-        if target.color is not None and self.scale == 1:
-            return carry, jnp.asarray(target.color)
         values: dict[str, Any] = self._first_values(carry, history, target, future)
         for host, group in groupby(self.active(history, target, future), key=lambda stage: stage.host):
             row = tuple(group)
             values |= _run(row, self.state, values) if host else self._rows(row)(self.state, values)
-        return values["carry"], values["image"]
+        return values["carry"], self._answer(values["image"], history, target)
 
     def _rows(self, row: tuple[Stage, ...]) -> Callable[[Any, Values], dict[str, Any]]:
         if row not in self._compiled_rows:
@@ -289,7 +378,7 @@ class Method:
             for i, frame in enumerate(frames):
                 size = check_frame(f"{role}[{i}]", frame, size=size)
         check_frame("target", target, size=size)
-        if not rendered(history):
+        if target.color is None and not rendered(history):
             raise ValueError(f"history: expected a frame with colour, got {len(history)} frames without")
 
     @cached_property
@@ -310,7 +399,7 @@ class Method:
         if len(self.networks) != 1:
             raise ValueError(f"method {self.name!r}: expected one network, it has {', '.join(self.networks) or 'none'}")
         (function,) = self.networks.values()
-        return partial(jax.jit(function), self.state)
+        return partial(jax.jit(function), self.weights)
 
     @cached_property
     def jitted_stages(self) -> dict[str, Callable[[Any, Values], dict[str, Any]]]:
@@ -319,7 +408,10 @@ class Method:
 
     def init(self, history: Frames, target: Frame) -> Any:
         """The carry before the first step; `()` for methods without memory."""
-        return () if self.start is None else self.start(history, target)
+        if self.start is None:
+            return ()
+        values = self.first_values((), history, target)
+        return self.start(values["history"], values["target"])
 
     def step(
         self, carry: Any, history: Frames, target: Frame, future: Frames = ()

@@ -4,6 +4,8 @@ The flow is OpenCV's, computed on the host, so that this method has no pure func
 compiled like those of any method.
 """
 
+from typing import Literal
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,6 +14,7 @@ from jaxtrapolate.checks import ArrayLike
 from jaxtrapolate.methods.between import PAIR
 from jaxtrapolate.methods.blending import evenly
 from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.ops.radiance import srgb_encode, tonemap
 from jaxtrapolate.ops.warp import backward_warp
 
@@ -28,8 +31,18 @@ def gray(color: ArrayLike) -> np.ndarray:
     return np.round(255 * (np.asarray(shown) @ np.array([0.299, 0.587, 0.114], np.float32))).astype(np.uint8)
 
 
-def dis_flow(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """DIS optical flow `[H, W, 2]` from a grey image to another (uint8 `[H, W]`), in pixels to add; preset medium.
+Preset = Literal["ultrafast", "fast", "medium"]
+
+
+@settings
+class FlowSettings:
+    """Of the optical flow."""
+
+    preset: Preset = option("medium", "OpenCV's: the better, the slower", choices=Preset)
+
+
+def dis_flow(first: np.ndarray, second: np.ndarray, *, preset: Preset = "medium") -> np.ndarray:
+    """DIS optical flow `[H, W, 2]` from a grey image to another (uint8 `[H, W]`), in pixels to add.
 
     References: Kroeger et al. 2016 (Fast optical flow using dense inverse search), as in OpenCV.
     """
@@ -38,12 +51,14 @@ def dis_flow(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     height, width = first.shape
     padding = ((0, max(0, _LEAST - height)), (0, max(0, _LEAST - width)))
     first, second = (np.ascontiguousarray(np.pad(image, padding, mode="edge")) for image in (first, second))
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, None)  # type: ignore[call-overload]
+    number = {"ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST, "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST}
+    search = cv2.DISOpticalFlow.create(number.get(preset, cv2.DISOPTICAL_FLOW_PRESET_MEDIUM))
+    flow = search.calc(first, second, None)  # type: ignore[call-overload]
     return np.asarray(flow[:height, :width], np.float32)
 
 
 def dis() -> Method:
-    """Both rendered frames fetched along their optical flow (DIS, preset medium) and mixed by time.
+    """Both rendered frames fetched along their optical flow (DIS, preset medium unless said) and mixed by time.
 
     With F and B the flows from the previous to the next frame and back, the flow from the target to the previous frame
     is taken for -alpha (1 - alpha) F + alpha^2 B at the target's own pixel, that to the next for (1 - alpha)^2 F -
@@ -56,7 +71,8 @@ def dis() -> Method:
 
     def flow(state, values: Values):
         first, second = gray(values["previous"].color), gray(values["next"].color)
-        return {"forward": jnp.asarray(dis_flow(first, second)), "backward": jnp.asarray(dis_flow(second, first))}
+        pairs = {"forward": (first, second), "backward": (second, first)}
+        return {name: jnp.asarray(dis_flow(*pair, preset=state.settings.preset)) for name, pair in pairs.items()}
 
     def function(state, values: Values):
         forward, backward = values["forward"], values["backward"]
@@ -67,4 +83,4 @@ def dis() -> Method:
         return {"image": mix(first, second, evenly(alpha, first))}
 
     stages = (PAIR, Stage("optical flow", flow, host=True, extra="flow"), Stage("fetch", function))
-    return Method("dis", stages, kind="interpolation", future=1)
+    return Method("dis", stages, kind="interpolation", future=1, settings=FlowSettings())

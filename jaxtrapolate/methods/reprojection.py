@@ -12,9 +12,11 @@ from jaxtrapolate.bidirectional.assisted import agree
 from jaxtrapolate.bidirectional.flows import camera_flow
 from jaxtrapolate.methods.between import depth_of
 from jaxtrapolate.methods.method import Frames, Method, Stage, Values, rendered
+from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.stages import REPROJECT, SKY
 from jaxtrapolate.ops.depth import changed
 from jaxtrapolate.ops.fill import fill_around
+from jaxtrapolate.ops.jitter import jitter_difference, shift_motion
 from jaxtrapolate.ops.scatter import splat_nearest
 from jaxtrapolate.ops.warp import backward_warp, in_frame
 from jaxtrapolate.precision import widest
@@ -23,14 +25,20 @@ from jaxtrapolate.records import Frame
 Shade = Callable[[Frame, Bool[Array, "h w"]], Float[Array, "h w 3"]]
 """What a renderer does on a cache miss: colours `[H, W, 3]` for a target, looked at where the mask `[H, W]` is True."""
 
-_EPSILON = 0.05  # relative difference of depths of one point
+
+@settings
+class DepthTest:
+    """Of the test whether two depths are of one point."""
+
+    epsilon: float = option(0.05, "the relative difference of depths of one point is less", low=0)
 
 
 def reprojection(shade: Shade | None = None) -> Method:
     """Reverse reprojection: the newest frame along the target's own motion, and a depth test that finds cache misses.
 
-    A pixel misses where its motion leads outside, or where the depth there is not its own: compared relatively (5 %),
-    after the change of depth that the cameras tell where positions and both cameras are there, else as it is.
+    A pixel misses where its motion leads outside, or where the depth there is not its own: compared relatively
+    (`epsilon`), after the change of depth that the cameras tell where positions and both cameras are there, else as it
+    is.
 
     Args:
         shade: renders what missed, given the target (which has no colour: a held-back frame's is never seen) and the
@@ -53,7 +61,12 @@ def reprojection(shade: Shade | None = None) -> Method:
         motion, expected = values["motion"], values["target"].gbuffer.depth
         expected = changed(expected, values["change"]) if "change" in values else expected
         found = backward_warp(values["newest"].gbuffer.depth, motion, filter="nearest")
-        return {"missed": ~(in_frame(motion) & agree(found, expected, jnp.asarray(_EPSILON), "metric")[..., 0])}
+        return {
+            "missed": ~(
+                in_frame(motion)
+                & agree(found, expected, jnp.asarray(state.settings.epsilon, found.dtype), "metric")[..., 0]
+            )
+        }
 
     def fetch(state, values: Values):
         image = backward_warp(values["newest"].color, values["motion"])
@@ -71,7 +84,7 @@ def reprojection(shade: Shade | None = None) -> Method:
         Stage("fetch", fetch),
         SKY,
     )
-    return Method("reproject" if shade is None else "reproject_shade", stages)
+    return Method("reproject" if shade is None else "reproject_shade", stages, settings=DepthTest())
 
 
 def steps_onward(history: Frames, target: Frame) -> Float[Array, ""]:
@@ -101,8 +114,13 @@ NEWEST = Stage("newest", _newest, reads=("history.color",))
 
 
 def _linear(state, values: Values):
-    motion = values["newest"].motion
-    return {"onward": -values["steps"].astype(motion.dtype) * motion}
+    history, target = values["history"], values["target"]
+    index = rendered(history)[0]
+    newest, motion = history[index], history[index].motion
+    if index and (difference := jitter_difference(newest, history[index - 1])) is not None:
+        motion = motion - difference.astype(motion.dtype)  # surfaces move, whatever the jitter does
+    onward = -values["steps"].astype(motion.dtype) * motion
+    return {"onward": shift_motion(onward, newest, target)}
 
 
 LINEAR = Stage("linear motion", _linear, reads=("history.motion",), optional=True)
@@ -144,9 +162,10 @@ def warp_3d() -> Method:
     No buffer of the target is looked at, but its camera. The forward motion of what is static is exact where cameras,
     positions and a stencil are there; else, and of what moves, it is the motion to the frame before, carried on
     linearly. A pixel covers the four around its landing place; each of these fetches its colour bilinearly along the
-    motion that landed on it. Where the fetch would meet another surface (depths differ by more than 5 %) the pixel is
-    beside a silhouette: there counts what lands within half a pixel, if anything does, and else the colour that landed.
-    A hole takes the colour of the farthest of the next covered pixels left, right, above and below (`fill_around`).
+    motion that landed on it. Where the fetch would meet another surface (depths differ by more than `epsilon`) the
+    pixel is beside a silhouette: there counts what lands within half a pixel, if anything does, and else the colour
+    that landed. A hole takes the colour of the farthest of the next covered pixels left, right, above and below
+    (`fill_around`).
 
     References: Mark et al. 1997, sections 2 and 3. Departures: one reference frame, the past one, so that nothing is
     known behind a silhouette; splats of four pixels with bilinear fetches for their mesh of triangles; objects move.
@@ -156,15 +175,20 @@ def warp_3d() -> Method:
         color, onward, depth = values["newest"].color, values["onward"], carried_depth(values)
         own = depth_of(values["newest"])
         own = depth if own is None else own
-        layers = jnp.concatenate([-onward, depth, own, color], -1)
+        layers = jnp.concatenate([-onward, *(a.astype(onward.dtype) for a in (depth, own, color))], -1)
 
         def land(footprint):
             """What landed, its fetched colour, its depth, where it is covered, and whether the fetch meets itself."""
             pushed, covered = splat_nearest(layers, onward, depth, footprint=footprint)
             back, expected, whole = pushed[..., :2], pushed[..., 3:4], pushed[..., 4:]
             found = backward_warp(own, back, filter="nearest")
-            same = agree(found, expected, jnp.asarray(_EPSILON), "metric")
-            return jnp.where(same, backward_warp(color, back), whole), pushed[..., 2:3], covered, same
+            same = agree(found, expected, jnp.asarray(state.settings.epsilon, found.dtype), "metric")
+            return (
+                jnp.where(same, backward_warp(color, back), whole.astype(color.dtype)),
+                pushed[..., 2:3],
+                covered,
+                same,
+            )
 
         (wide, wide_z, covered, same), (near, near_z, centred, _) = land(4), land(1)
         beside = centred[..., None] & ~same  # beyond a silhouette, and something lands there more exactly
@@ -175,4 +199,4 @@ def warp_3d() -> Method:
         return {"image": fill_around(values["warped"], values["covered"], depth=known)}
 
     stages = (NEWEST, LINEAR, CAMERA, Stage("push", push, reads=ONWARD_NEEDS), Stage("fill", fill))
-    return Method("warp_3d", stages)
+    return Method("warp_3d", stages, settings=DepthTest())

@@ -9,18 +9,29 @@ made of the layers for the target, and "image".
 """
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.method import Stage, Values, rendered
+from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.ops.holes import Taps, hole_masks
 from jaxtrapolate.ops.motion import chain_motion, occlusion_motion
 from jaxtrapolate.ops.radiance import By, demodulate, modulate
 from jaxtrapolate.ops.warp import backward_warp
 from jaxtrapolate.records import Frame, GBuffer, replace
+
+
+@settings
+class Demodulation:
+    """How colours are divided by the reflectance."""
+
+    by: By = option("albedo+specular", "what the colour is divided by before it is warped", choices=By)
+    floor: float = option(0.01, "the smallest divisor", low=0, high=1)
+    sky: bool = option(True, "whether the sky's colour is warped as it is; else its albedo counts")
+    margin: float = option(2.0, "how much better the undivided colour must agree to make up half", low=0, high=1000)
 
 
 def chain(frames: Sequence[Frame], first: int, last: int, *, before: Array | None = None) -> Array:
@@ -57,24 +68,24 @@ REPROJECT = reproject_stage()
 """Finds the newest rendered frame and the motion that leads there."""
 
 
-def demodulated(gbuffer: GBuffer | None, sky: bool) -> GBuffer:
+def reflecting(gbuffer: GBuffer | None, sky: bool) -> GBuffer:
     """The G-buffer as demodulation sees it."""
     gbuffer = check_present("gbuffer", gbuffer, needed_by="demodulation")
     return gbuffer if sky else replace(gbuffer, sky=None)
 
 
-def demodulate_stage(by: By = "albedo+specular", *, floor: float = 1e-2, sky: bool = True) -> Stage:
+def demodulate_stage(how: Any = None) -> Stage:
     """Divides the sources by their reflectance; without albedo the colour is warped as it is.
 
     Args:
-        by, floor: as of `demodulate`.
-        sky: whether the colour of the sky stays as it is; else its albedo counts.
+        how: has by, floor and sky, as `Demodulation`; `None` = the method's options.
     """
 
     def function(state, values: Values):
-        layers = []
+        layers, given = [], how or state.settings
         for source in values["sources"]:
-            irradiance = demodulate(source.color, demodulated(source.gbuffer, sky), by=by, floor=floor)
+            buffers = reflecting(source.gbuffer, given.sky)
+            irradiance = demodulate(source.color, buffers, by=given.by, floor=given.floor)
             both = "plain_share" in values
             layers.append(jnp.concatenate([irradiance, source.color], -1) if both else irradiance)
         return {"layers": tuple(layers)}
@@ -87,7 +98,7 @@ def layers(values: Values) -> tuple[Array, ...]:
     return values["layers"] if "layers" in values else tuple(source.color for source in values["sources"])
 
 
-def modulate_stage(by: By = "albedo+specular", *, floor: float = 1e-2, sky: bool = True) -> Stage:
+def modulate_stage(how: Any = None) -> Stage:
     """Multiplies by the target's reflectance, and mixes in the colour that was warped as it is, by "plain_share".
 
     That colour is the method's own; the plain warp's where neither way has erred, so that what stands still is exact.
@@ -96,7 +107,9 @@ def modulate_stage(by: By = "albedo+specular", *, floor: float = 1e-2, sky: bool
     """
 
     def function(state, values: Values):
-        image = modulate(values["warped"][..., :3], demodulated(values["target"].gbuffer, sky), by=by, floor=floor)
+        given = how or state.settings
+        buffers = reflecting(values["target"].gbuffer, given.sky)
+        image = modulate(values["warped"][..., :3], buffers, by=given.by, floor=given.floor)
         if "plain_share" in values:
             share, own = values["plain_share"], values["warped"][..., 3:]
             exact = backward_warp(values["newest"].color, values["motion"])

@@ -1,21 +1,25 @@
 """The methods without weights that warp the newest rendered frame."""
 
+from typing import Any
+
 import jax.numpy as jnp
 
-from jaxtrapolate.methods.hindsight import hindsight_stage
+from jaxtrapolate.methods.hindsight import HINDSIGHT
 from jaxtrapolate.methods.method import Method, Stage, Values, rendered
+from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.stages import (
     HOLES,
     OCCLUSION,
     REPROJECT,
     SKY,
+    Demodulation,
     composite,
     demodulate_stage,
     layers,
     modulate_stage,
 )
 from jaxtrapolate.ops.guided import far_motion, guided_warp
-from jaxtrapolate.ops.warp import backward_warp
+from jaxtrapolate.ops.warp import Filter, backward_warp
 
 
 def repeat() -> Method:
@@ -28,13 +32,20 @@ def repeat() -> Method:
     return Method("repeat", (Stage("repeat", function, reads=("history.color",)),))
 
 
+@settings
+class WarpSettings:
+    """How a frame is fetched."""
+
+    filter: Filter = option("bilinear", "how colours are interpolated between pixels", choices=Filter)
+
+
 def warp() -> Method:
     """The newest rendered frame, its colour as it is, fetched along the motion vectors."""
 
     def function(state, values: Values):
-        return {"image": backward_warp(values["newest"].color, values["motion"])}
+        return {"image": backward_warp(values["newest"].color, values["motion"], filter=state.settings.filter)}
 
-    return Method("warp", (REPROJECT, Stage("warp", function), SKY))
+    return Method("warp", (REPROJECT, Stage("warp", function), SKY), settings=WarpSettings())
 
 
 def occlusion_warp() -> Method:
@@ -48,17 +59,35 @@ def occlusion_warp() -> Method:
         REPROJECT,
         OCCLUSION,
         HOLES,
-        hindsight_stage(),
+        HINDSIGHT,
         demodulate_stage(),
         Stage("composite", function),
         modulate_stage(),
         SKY,
     )
-    return Method("occlusion_warp", stages, past=2)
+    return Method("occlusion_warp", stages, past=2, settings=Demodulation())
 
 
 _GUIDES = ("albedo", "normal")
-ROWS = 180  # of frames that kernels of 10 pixels suit; see experiments/guided_reach.py
+
+
+@settings
+class Guide:
+    """How the guided warp looks for like pixels; `rows` is measured in experiments/guided_reach.py."""
+
+    rows: int | None = option(
+        180, "of frames that the kernels suit; in larger ones holes are led further off", low=1, high=65536, none=True
+    )
+    keep: int = option(4, "how many of the most similar pixels are blended", low=1, high=33)
+    strides: tuple[int, ...] = option((1, 3, 5, 9), "of the kernels of 3 x 3 pixels, in pixels", low=1, high=64)
+    sigma_guide: float = option(0.03, "of the Gaussian of the guides' difference (albedo, normal)", low=0)
+    sigma_space: float = option(0.5, "of the Gaussian of the distance on the screen, in pixels", low=0)
+    unlike: float = option(0.1, "squared difference of guides from which on a hole is led further off", low=0)
+
+
+@settings
+class GuidedSettings(Guide, Demodulation):
+    """Of demodulation and of the guided warp."""
 
 
 def guides(target, source):
@@ -72,38 +101,35 @@ def guides_of(role: str) -> str:
     return "|".join(f"target+{role}.{name}" for name in (*_GUIDES, "stencil"))
 
 
-def fetch_guided(image, motion, holes, target, source, *, rows: int | None = ROWS):
-    """The image by the guided warp along the motion; in holes as far off as in a frame of about `rows` rows.
+def fetch_guided(image, motion, holes, target, source, how: Any):
+    """The image by the guided warp along the motion; in holes as far off as in a frame of about `how.rows` rows.
 
     From twice that many rows on, holes are first led to a like surface by a coarse search (`far_motion`); `None` leaves
-    that out.
+    that out. how: a `Guide`.
     """
     target_guide, source_guide = guides(target, source)
-    step = motion.shape[0] // (rows or motion.shape[0])
+    step = motion.shape[0] // (how.rows or motion.shape[0])
     if step > 1:
-        motion = far_motion(motion, target_guide, source_guide, holes, step=step)
-    return guided_warp(image, motion, target_guide, source_guide)
+        motion = far_motion(motion, target_guide, source_guide, holes, step=step, unlike=how.unlike)
+    sigmas = {"sigma_guide": how.sigma_guide, "sigma_space": how.sigma_space}
+    return guided_warp(image, motion, target_guide, source_guide, strides=how.strides, keep=how.keep, **sigmas)
 
 
-def guided_stage(*, rows: int | None = ROWS) -> Stage:
-    """Fetches the newest layer from the most similar pixels around where the motion leads; see `fetch_guided`."""
-
-    def function(state, values: Values):
-        frames = values["target"].gbuffer, values["newest"].gbuffer
-        warped = fetch_guided(layers(values)[0], values["motion"], values["holes"], *frames, rows=rows)
-        return {"warped": warped, "image": warped[..., :3]}
-
-    return Stage("guided warp", function, reads=(guides_of("newest"),))
+def _guided(state, values: Values):
+    frames = values["target"].gbuffer, values["newest"].gbuffer
+    warped = fetch_guided(layers(values)[0], values["motion"], values["holes"], *frames, state.settings)
+    return {"warped": warped, "image": warped[..., :3]}
 
 
-def guided(*, rows: int | None = ROWS) -> Method:
+GUIDED = Stage("guided warp", _guided, reads=(guides_of("newest"),))
+"""Fetches the newest layer from the most similar pixels around where the motion leads; see `fetch_guided`."""
+
+
+def guided() -> Method:
     """The demodulated frame fetched from the most similar pixels around where the motion leads (ExtraSS).
-
-    Args:
-        rows: of frames that the kernels suit; in larger ones holes are led further off. `None` = by the kernels alone.
 
     References:
         Wu et al. 2023 (ExtraSS), section 4.2. Departure: `far_motion` before it, in frames of 360 rows or more.
     """
-    stages = (REPROJECT, HOLES, hindsight_stage(), demodulate_stage(), guided_stage(rows=rows), modulate_stage(), SKY)
-    return Method("guided_warp", stages, past=2)
+    stages = (REPROJECT, HOLES, HINDSIGHT, demodulate_stage(), GUIDED, modulate_stage(), SKY)
+    return Method("guided_warp", stages, past=2, settings=GuidedSettings())

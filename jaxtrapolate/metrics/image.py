@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxtrapolate.checks import check_image
-from jaxtrapolate.precision import widest
+from jaxtrapolate.checks import ArrayLike, check_image
+from jaxtrapolate.precision import divide, widest
 
 _SIGMA = 1.5
 _RADIUS = 5  # an 11 x 11 window
 
 
-def counted(mask: Array) -> Array:
+def counted(mask: ArrayLike) -> ArrayLike:
     """Where a mask, bool or weights, is more than nothing."""
     return mask if mask.dtype == bool else mask > 0
 
@@ -28,7 +28,7 @@ def _mean(values, mask):
     mask = jnp.broadcast_to(mask, values.shape).astype(values.dtype)
     count = jnp.sum(mask)
     total = jnp.sum(mask * jnp.where(mask > 0, values, 0))
-    return jnp.where(count > 0, total / jnp.where(count > 0, count, 1), jnp.nan)
+    return divide(total, count, otherwise=jnp.nan)
 
 
 def _squared_error(first, second, mask):
@@ -39,8 +39,17 @@ def _squared_error(first, second, mask):
     return _mean(jnp.square(first - second), mask)
 
 
-def check_pair(first: Array, second: Array, mask: Array | None) -> None:
-    """Raise unless two images and a mask fit each other."""
+def check_pair(first: ArrayLike, second: ArrayLike, mask: ArrayLike | None) -> None:
+    """Raises where two images and a mask do not fit each other.
+
+    Args:
+        first: `[H, W, C]`.
+        second: of the same shape.
+        mask: `[H, W, 1]`, or `None`.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, or shapes that differ.
+    """
     size = check_image("first", first)
     check_image("second", second, size=size, channels=first.shape[-1])
     if mask is not None and tuple(mask.shape) != (*size, 1):
@@ -52,7 +61,8 @@ def mse(first: Float[Array, "h w c"], second: Float[Array, "h w c"], *, mask: Ar
     """The mean squared difference over all channels.
 
     Args:
-        first, second: `[H, W, C]`; the sum is taken in at least float32.
+        first: `[H, W, C]`; the sum is taken in at least float32.
+        second: of the same shape.
         mask: `[H, W, 1]`, bool or weights: the pixels that count.
 
     Returns:
@@ -76,7 +86,8 @@ def psnr(
     """Peak signal-to-noise ratio in dB: 10 log10(peak^2 / mse).
 
     Args:
-        first, second: `[H, W, C]`.
+        first: `[H, W, C]`.
+        second: of the same shape.
         peak: the largest value.
         mask: `[H, W, 1]`, bool or weights: the pixels that count.
 
@@ -97,7 +108,7 @@ def psnr(
 
 
 def _blur(image):
-    """The Gaussian of an 11 x 11 window over the places where it fits, `[H - 10, W - 10, C]`."""
+    """The Gaussian of an 11 x 11 window at the positions where it fits, `[H - 10, W - 10, C]`."""
     offsets = np.arange(-_RADIUS, _RADIUS + 1)
     kernel = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
     kernel = kernel / kernel.sum()
@@ -114,7 +125,8 @@ def ssim_map(
     """SSIM at each pixel that is at least 5 from the border, mean over channels; `ssim` is its mean over pixels.
 
     Args:
-        first, second: `[H, W, C]`, at least 11 x 11.
+        first: `[H, W, C]`, at least 11 x 11.
+        second: of the same shape.
         peak: the largest value.
 
     Returns:
@@ -151,7 +163,8 @@ def ssim(
     """Structural similarity, mean over pixels and channels.
 
     Args:
-        first, second: `[H, W, C]`, at least 11 x 11.
+        first: `[H, W, C]`, at least 11 x 11.
+        second: of the same shape.
         peak: the largest value.
         mask: `[H, W, 1]`, bool or weights: the pixels that count, the five at each border left out.
 

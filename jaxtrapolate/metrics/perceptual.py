@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,8 @@ from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_inst
 from jaxtrapolate.metrics.imagenet import LPIPS_LAYERS, Net, NetworkWeights, features
 from jaxtrapolate.metrics.imagenet import network_weights as network_weights
 from jaxtrapolate.metrics.imagenet import vgg_features as vgg_features
-from jaxtrapolate.precision import widest
+from jaxtrapolate.ops.warp import root
+from jaxtrapolate.precision import divide, widest
 
 VmafModel = Literal["vmaf_v0.6.1", "vmaf_v0.6.1neg", "vmaf_4k_v0.6.1"]
 
@@ -54,8 +55,9 @@ def flip_map(
     """The FLIP error at each pixel: the difference seen when the two images alternate on a display.
 
     Args:
-        image, reference: `[H, W, 3]`. With `hdr=False` sRGB display values, clipped to 0..1; with `hdr=True` linear
-            radiance with the primaries of sRGB, clipped at 0, looked at under exposures chosen from the reference.
+        image: `[H, W, 3]`. With `hdr=False` sRGB display values, clipped to 0..1; with `hdr=True` linear radiance with
+            the primaries of sRGB, clipped at 0, looked at under exposures chosen from the reference.
+        reference: the ground truth, likewise.
         hdr: HDR-FLIP.
         pixels_per_degree: of the visual field; by default 67, a 4K display 0.7 m wide at 0.7 m.
 
@@ -76,18 +78,18 @@ def flip_map(
     """
     check_installed("flip")
     truth = _concrete("reference", reference)
-    made = _concrete("image", image, like=truth)
+    generated = _concrete("image", image, like=truth)
     parameters: dict[str, float] = {}
     if pixels_per_degree is not None:
         if not pixels_per_degree > 0:
             raise ValueError(f"pixels_per_degree: expected a positive number, got {pixels_per_degree}")
         parameters["ppd"] = float(pixels_per_degree)
-    made, truth = (np.clip(a, 0, None if hdr else 1) for a in (made, truth))
+    generated, truth = (np.clip(a, 0, None if hdr else 1) for a in (generated, truth))
     if hdr and np.max(truth @ _LUMINANCE) <= 2 * _DARKEST:  # the package would end the process
         stop = math.log2(2.1189 / _DARKEST)
         parameters |= {"startExposure": stop, "stopExposure": stop, "numExposures": 2}
     evaluate = importlib.import_module("flip_evaluator").evaluate
-    error, _, _ = evaluate(truth, made, "HDR" if hdr else "LDR", not hdr, False, False, parameters)
+    error, _, _ = evaluate(truth, generated, "HDR" if hdr else "LDR", not hdr, False, False, parameters)
     return np.asarray(error, np.float32)
 
 
@@ -101,8 +103,10 @@ def flip(
     """The mean of `flip_map`: 0 for equal images, at most 1.
 
     Args:
-        image, reference: `[H, W, 3]`, sRGB display values, or linear radiance with `hdr=True`.
-        hdr, pixels_per_degree: as for `flip_map`.
+        image: `[H, W, 3]`, sRGB display values, or linear radiance with `hdr=True`.
+        reference: the ground truth, likewise.
+        hdr: as for `flip_map`.
+        pixels_per_degree: as for `flip_map`.
 
     Raises:
         ImportError, TypeError, ValueError: as `flip_map`.
@@ -117,8 +121,7 @@ _SMALLEST = {"vgg": 16, "alex": 31}  # pixels that leave one in the last layer
 
 def _normalized(features):
     square = jnp.sum(jnp.square(features), -1, keepdims=True)
-    lit = square > 0  # the square root has no gradient at 0
-    return jnp.where(lit, features / (jnp.sqrt(jnp.where(lit, square, 1)) + 1e-10), 0)
+    return divide(features, root(square) + 1e-10, where=square > 0)
 
 
 @partial(jax.jit, static_argnames=("net",))
@@ -143,8 +146,9 @@ def lpips(
     """Learned perceptual image patch similarity: the weighted squared distance of two images' deep features.
 
     Args:
-        image, reference: `[H, W, 3]`, display values in 0..1 (the network's -1..1 is made within), at least 31 x 31 for
-            "alex" and 16 x 16 for "vgg". Computed in at least float32, at the highest precision of products.
+        image: `[H, W, 3]`, display values in 0..1 (scaled to the network's -1..1 within), at least 31 x 31 for "alex"
+            and 16 x 16 for "vgg". Computed in at least float32, at the highest precision of products.
+        reference: the ground truth, likewise.
         net: "alex" is the better and faster score, "vgg" the smoother loss.
         weights: of `network_weights(net)`, by default those. Under jit hand them over as an argument, or they become
             constants of the compiled program.
@@ -163,7 +167,7 @@ def lpips(
     References:
         Zhang et al. 2018, version 0.1 of the heads, as the authors' lpips.LPIPS(net=net) in evaluation.
     """
-    check_choice("net", net, ("vgg", "alex"))
+    check_choice("net", net, get_args(Net))
     size = check_image("image", image, channels=3)
     check_image("reference", reference, size=size, channels=3)
     least = _SMALLEST[net]
@@ -213,7 +217,7 @@ def _compare(frames: Frames, reference: Frames, *, least: int, filter: str, log:
     check_installed("vmaf")
     with tempfile.TemporaryDirectory(prefix="jaxtrapolate-") as name:
         folder = Path(name)
-        count, size = _write_raw("frames", frames, folder / "made.rgb")
+        count, size = _write_raw("frames", frames, folder / "frames.rgb")
         other, expected = _write_raw("reference", reference, folder / "reference.rgb")
         if (count, size) != (other, expected):
             what = "frames of {} x {}"
@@ -225,7 +229,7 @@ def _compare(frames: Frames, reference: Frames, *, least: int, filter: str, log:
         luma = "scale=in_range=pc:out_range=tv:out_color_matrix=bt709:flags=accurate_rnd+bitexact,format=yuv444p"
         graph = f"[0:v]{luma}[a];[1:v]{luma}[b];[a][b]{filter}"
         program = importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
-        command = [program, "-hide_banner", "-nostdin", "-loglevel", "error", *raw, "made.rgb", *raw, "reference.rgb"]
+        command = [program, "-hide_banner", "-nostdin", "-loglevel", "error", *raw, "frames.rgb", *raw, "reference.rgb"]
         done = subprocess.run(
             [*command, "-lavfi", graph, "-f", "null", "-"], cwd=folder, capture_output=True, check=False
         )
@@ -240,9 +244,10 @@ def vmaf(frames: Frames, reference: Frames, *, model: VmafModel = "vmaf_v0.6.1",
     """VMAF of a clip: 0..100, more is better; the predicted mean opinion of viewers, of the luma alone.
 
     Args:
-        frames, reference: the made and the true clip, `[T, H, W, 3]` or iterables of `[H, W, 3]`, at least 17 x 17:
-            uint8, or display values that are clipped to 0..1 and rounded to 8 bits. Successive frames are the display's
+        frames: the generated clip, `[T, H, W, 3]` or an iterable of `[H, W, 3]`, at least 17 x 17: uint8, or
+            display values that are clipped to 0..1 and rounded to 8 bits. Successive frames are the display's
             successive frames: motion between them counts.
+        reference: the ground truth, likewise.
         model: "vmaf_v0.6.1" for a 1080p display, "vmaf_4k_v0.6.1" for 4K, "vmaf_v0.6.1neg" gives nothing for
             sharpening.
         threads: of libvmaf.
@@ -258,7 +263,7 @@ def vmaf(frames: Frames, reference: Frames, *, model: VmafModel = "vmaf_v0.6.1",
     References:
         Li et al. 2016, by libvmaf. Temporary files hold both clips as raw 8-bit RGB, removed afterwards.
     """
-    check_choice("model", model, ("vmaf_v0.6.1", "vmaf_v0.6.1neg", "vmaf_4k_v0.6.1"))
+    check_choice("model", model, get_args(VmafModel))
     options = f"log_fmt=json:log_path=log.json:n_threads={int(threads)}:model=version={model}"
     log = json.loads(_compare(frames, reference, least=17, filter=f"libvmaf={options}", log="log.json"))
     values = np.array([frame["metrics"]["vmaf"] for frame in log["frames"]])
@@ -266,10 +271,11 @@ def vmaf(frames: Frames, reference: Frames, *, model: VmafModel = "vmaf_v0.6.1",
 
 
 def xpsnr(frames: Frames, reference: Frames) -> ClipScore:
-    """Extended perceptually weighted PSNR of a clip's luma in dB: errors weigh less in busy and moving places.
+    """Extended perceptually weighted PSNR of a clip's luma in dB: errors weigh less in busy and moving regions.
 
     Args:
-        frames, reference: the made and the true clip, as for `vmaf`, of any size.
+        frames: the generated clip, as for `vmaf`, of any size.
+        reference: the ground truth, likewise.
 
     Returns:
         Mean of the frames' dB, and each frame's; infinite for equal frames.

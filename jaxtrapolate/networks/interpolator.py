@@ -18,7 +18,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_array
-from jaxtrapolate.networks.blocks import HE, Layer, double, pad_to_multiple, shuffle
+from jaxtrapolate.networks.blocks import HE, Layer, pad_to_multiple, pixel_shuffle, upsample_2x
 from jaxtrapolate.ops.warp import landing, sample
 from jaxtrapolate.precision import widest
 
@@ -53,7 +53,7 @@ class Decoder(nnx.Module):
 
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b i j d"]:
         hidden = self.join(x)
-        return shuffle(self.head(hidden + self.refine(hidden)))
+        return pixel_shuffle(self.head(hidden + self.refine(hidden)))
 
 
 @jax.vmap
@@ -93,9 +93,10 @@ class Interpolator(nnx.Module):
         """The frame between.
 
         Args:
-            first, second: `[B, H, W, 3]`, two frames one unit of time apart, in the domain that the weights were
-                trained in: `log_encode` of radiance, or display values. Any size from 1 x 1 on: inside it is padded,
-                see `pad_to_multiple`.
+            first: `[B, H, W, 3]`, in the domain that the weights were trained in:
+                `log_encode` of radiance, or display values. Any size from 1 x 1 on: inside it is padded, see
+                `pad_to_multiple`.
+            second: the frame one unit of time later, likewise.
             time: `[B]` in 0..1, 0 at the first.
 
         Returns:
@@ -141,7 +142,7 @@ class Interpolator(nnx.Module):
         flow = code[..., :4].astype(wide)
         for decoder in finer:
             code = decoder(join(code[..., 4:], *fetch(pyramid.pop(), flow), flow))
-            flow = 2 * double(flow, aligned=False) + code[..., :4].astype(wide)
+            flow = 2 * upsample_2x(flow, aligned=False) + code[..., :4].astype(wide)
         a, b = fetch(frames, flow)
         code = code.astype(wide)
         mask, residual = jax.nn.sigmoid(jnp.clip(code[..., 4:5], -10, 10)), code[..., 5:]

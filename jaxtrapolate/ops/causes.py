@@ -10,6 +10,7 @@ from jaxtrapolate.checks import check_image, check_present
 from jaxtrapolate.ops.depth import changed, surface_depth
 from jaxtrapolate.ops.holes import hole_masks
 from jaxtrapolate.ops.warp import backward_warp, in_frame
+from jaxtrapolate.precision import divide
 from jaxtrapolate.records import Frame, GBuffer, Keyframe, check_frame
 
 CAUSES = ("border", "hole", "shadow", "glossy", "edge", "rest")
@@ -27,12 +28,13 @@ def disoccluded(target: Keyframe, source: Keyframe) -> Bool[Array, "h w"]:
     """Whether the surface at a target pixel was hidden in the source frame: exact, by depth.
 
     The depth that the surface had in the source frame, depth + the backward flow's change, is more than 2 % beyond the
-    source's depth (bilinear) at the place where the backward flow leads. False beyond the frame. Where one shows
-    nothing (depth that is not positive, or infinite; in the source at the pixel nearest to that place) and the other a
-    surface, it was hidden or not there; where both show nothing it was not.
+    source's depth (bilinear) at the position that the backward flow leads to. False beyond the frame. Where one shows
+    nothing (depth that is not positive, or infinite; in the source at the pixel nearest to that position) and the other
+    a surface, it was hidden or not there; where both show nothing it was not.
 
     Args:
-        target: with depth and backward_flow. source: the I-frame before it, with depth; both in one metric unit.
+        target: with depth and backward_flow.
+        source: the I-frame before it, with depth; both in one metric unit.
 
     Returns:
         Bool `[H, W]`.
@@ -86,7 +88,7 @@ def edges(gbuffer: GBuffer, *, metric_depth: bool) -> Bool[Array, "h w 1"] | Non
     if gbuffer.depth is not None:
         depth = surface_depth(gbuffer.depth, gbuffer.sky)
         bare = ~(depth < jnp.inf)
-        value = jnp.where(bare, 0, 1 / jnp.where(bare, 1, depth)) if metric_depth else jnp.where(bare, 0, depth)
+        value = divide(1, depth, where=~bare) if metric_depth else jnp.where(bare, 0, depth)
         scale = value if metric_depth else jnp.ones_like(value)
         for axis in (0, 1):
             if value.shape[axis] < 3:
@@ -148,8 +150,9 @@ def cause_map(
     more than 0.2. glossy: roughness below 0.3. edge: depth or normal jumps within 2 pixels. rest.
 
     Args:
-        target: the true frame, with its shadow. source: the rendered frame that is warped. motion: from target to
-            source.
+        target: the ground truth, with its shadow.
+        source: the rendered frame that is warped.
+        motion: from target to source.
         hidden: the exact holes (`disoccluded`); without it the union of the `hole_masks` that the buffers allow.
         metric_depth: whether depth is a distance, or only ordered.
 

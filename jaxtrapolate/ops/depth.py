@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.checks import ArrayLike, check_image
-from jaxtrapolate.precision import widest
+from jaxtrapolate.precision import divide, widest
 from jaxtrapolate.records import Frame, Keyframe, replace
 
 _HELD = 1e30  # in place of infinity
@@ -85,7 +85,7 @@ def apart(first: Array, second: Array) -> Array:
     first, second = jax.lax.stop_gradient(tuple(held(a.astype(wide)) for a in (first, second)))
     near = jnp.minimum(first, second)
     one = (first < _HELD) != (second < _HELD)
-    return jnp.where(one, _HELD / jnp.where(near > 0, near, 1), jnp.abs(first - second))
+    return jnp.where(one, divide(_HELD, near, otherwise=_HELD), jnp.abs(first - second))
 
 
 def held(depth: Array) -> Array:

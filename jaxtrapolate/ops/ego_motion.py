@@ -1,7 +1,7 @@
 """The camera's own motion, found from depth and motion vectors, and which objects move as it does.
 
-A point of a static scene at pixel (x, y) and depth z is seen by a pinhole camera that moved at a place that is linear
-in homogeneous coordinates: (u, v, w) = M (x, y, 1, 1 / z), at (u / w, v / w), whatever the focal lengths of both
+A point of a static scene at pixel (x, y) and depth z is seen by a pinhole camera that moved at a position that is
+linear in homogeneous coordinates: (u, v, w) = M (x, y, 1, 1 / z), at (u / w, v / w), whatever the focal lengths of both
 cameras (M is K' [R K^-1 | t] up to scale). So the motion of all that is static follows from one matrix of 3 x 4, which
 is fitted to points by the direct linear transform (Hartley & Zisserman, Multiple View Geometry, section 4.1), and to
 those of one motion among several by random samples (Fischler & Bolles 1981). Computed in float64 on the host.
@@ -20,8 +20,8 @@ def features(depth: np.ndarray) -> np.ndarray:
     height, width = depth.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float64)
     scale = _scale(height, width)
-    finite = np.isfinite(depth[..., 0]) & (depth[..., 0] > 0)
-    inverse = np.where(finite, 1 / np.where(finite, depth[..., 0].astype(np.float64), 1), 0)
+    along = depth[..., 0].astype(np.float64)
+    inverse = np.divide(1, along, out=np.zeros_like(along), where=np.isfinite(along) & (along > 0))
     inverse /= max(inverse.max(), 1e-300)
     return np.stack([(x - width / 2) / scale, (y - height / 2) / scale, np.ones_like(x), inverse], -1)
 
@@ -108,7 +108,8 @@ def static_ids(stencil: np.ndarray, off: np.ndarray, *, least: int = 16) -> dict
     """Of each id above 0 that covers enough pixels, whether it moves as a static object would.
 
     Args:
-        stencil: `[H, W, 1]`. off: of `off_camera`.
+        stencil: `[H, W, 1]`.
+        off: of `off_camera`.
         least: pixels that have motion.
 
     Returns:

@@ -1,5 +1,7 @@
 """Filling holes of a warped image from what is around them: by a pyramid, or from the next pixels."""
 
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -46,10 +48,11 @@ def fill_pyramid(image: Float[ArrayLike, "h w c"], covered: Bool[ArrayLike, "h w
     on, what is not covered is interpolated bilinearly from the level above.
 
     Args:
-        image: `[H, W, C]`. covered: bool `[H, W]`, False in holes.
+        image: `[H, W, C]`.
+        covered: bool `[H, W]`, False in holes.
 
     Returns:
-        `[H, W, C]`; covered pixels as they are, bit for bit. Holes in a constant image get the constant. Zero where
+        `[H, W, C]`; covered pixels unchanged, bit for bit. Holes in a constant image get the constant. Zero where
         nothing at all is covered.
 
     Edge cases:
@@ -63,7 +66,7 @@ def fill_pyramid(image: Float[ArrayLike, "h w c"], covered: Bool[ArrayLike, "h w
         TypeError, ValueError: no floating-point image, no bool mask, or sizes that differ.
 
     References:
-        Gortler et al. 1996 (The lumigraph), section 4.4; in the place of the hole filling in several scales of
+        Gortler et al. 1996 (The lumigraph), section 4.4; instead of the hole filling in several scales of
         Schollmeyer et al. 2017. Departure: coverage is 0 or 1 at every level. To take only the farther pixels of each
         block, as holes show background, gained nothing on embedded scenes.
     """
@@ -95,6 +98,21 @@ def _last(mask: Array, axis: int, reverse: bool) -> Array:
     return jnp.where(found < count, found, -1)
 
 
+def covered_around(covered: Bool[Array, "h w"]) -> Iterator[tuple[Array, Array, Array]]:
+    """The next covered pixel to the left, right, above and below each pixel, which is itself if covered.
+
+    Yields for each direction `[H, W]`: whether there is one, its index in the image's rows put one after the other
+    (in bounds in any case), and how many pixels away it is.
+    """
+    height, width = covered.shape
+    row, column = (jax.lax.broadcasted_iota(jnp.int32, (height, width), k) for k in (0, 1))
+    for axis, reverse in ((1, False), (1, True), (0, False), (0, True)):
+        found = _last(covered, axis, reverse)
+        there = jnp.maximum(found, 0)
+        index = row * width + there if axis == 1 else there * width + column
+        yield found >= 0, index, jnp.abs(found - (column if axis == 1 else row))
+
+
 @jax.jit
 def fill_around(
     image: Float[ArrayLike, "h w c"],
@@ -107,12 +125,13 @@ def fill_around(
     What comes into view behind a moving object is background, and so is the farther side of the hole.
 
     Args:
-        image: `[H, W, C]`. covered: bool `[H, W]`, False in holes.
+        image: `[H, W, C]`.
+        covered: bool `[H, W]`, False in holes.
         depth: `[H, W, 1]` of the image, smaller is nearer, what is not positive is nothing, and the farthest; without
             it the closest of the four pixels is taken.
 
     Returns:
-        `[H, W, C]`; covered pixels as they are. Of equal depths the closest, then left before right before above. Zero
+        `[H, W, C]`; covered pixels unchanged. Of equal depths the closest, then left before right before above. Zero
         where nothing is covered in a hole's row and column. NaN depth counts as nearest.
 
     Gradient:
@@ -132,18 +151,13 @@ def fill_around(
         far = surface_depth(jnp.asarray(depth))
         far = jnp.where(jnp.isnan(far), -jnp.inf, far).reshape(-1)
     covered = jnp.asarray(covered)
-    row, column = (jax.lax.broadcasted_iota(jnp.int32, size, k) for k in (0, 1))
     best = jnp.full(size, -1, jnp.int32)
     farthest = jnp.full(size, -jnp.inf, jnp.float32 if far is None else far.dtype)
     steps = jnp.full(size, height + width, jnp.int32)
-    for axis, reverse in ((1, False), (1, True), (0, False), (0, True)):
-        found = _last(covered, axis, reverse)
-        there = jnp.maximum(found, 0)
-        index = row * width + there if axis == 1 else there * width + column
-        apart = jnp.abs(found - (column if axis == 1 else row))
+    for found, index, apart in covered_around(covered):
         behind = jnp.zeros_like(farthest) if far is None else take_rows(far[:, None], index)[..., 0]
         better = (behind > farthest) | ((behind == farthest) & (apart < steps)) | (best < 0)
-        better &= found >= 0
+        better &= found
         best, farthest, steps = (
             jnp.where(better, a, b) for a, b in ((index, best), (behind, farthest), (apart, steps))
         )

@@ -6,7 +6,7 @@ Convention:
 """
 
 from functools import partial
-from typing import Literal, cast
+from typing import Literal, cast, get_args
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +16,10 @@ from jaxtrapolate.checks import check_array, check_choice, check_image
 from jaxtrapolate.ops.depth import surface_depth
 from jaxtrapolate.ops.scatter import splat_nearest
 from jaxtrapolate.ops.warp import backward_warp, landing, take_rows
+from jaxtrapolate.precision import divide
 from jaxtrapolate.records import Camera, Sign, Units, YAxis, check_camera
 
-_SIGNS = ("previous_minus_current", "current_minus_previous")
-_UNITS = ("pixels", "uv", "ndc")
-_Y_AXES = ("down", "up")
+Neighbours = Literal["diagonal", "cross", "square"]
 
 
 @jax.jit
@@ -28,7 +27,8 @@ def chain_motion(newer: Float[Array, "h w 2"], older: Float[Array, "h w 2"]) -> 
     """Motion over two steps: newer(p) + older(p + newer(p)).
 
     Args:
-        newer: `[H, W, 2]` from a frame to the one before it. older: `[H, W, 2]` from that to a still earlier one.
+        newer: `[H, W, 2]` from a frame to the one before it.
+        older: `[H, W, 2]` from that to a still earlier one.
 
     Returns:
         `[H, W, 2]` from the newest to the oldest of the three frames.
@@ -73,9 +73,9 @@ def convert_motion(motion: Float[Array, "h w 2"], *, sign: Sign, units: Units, y
         prints a velocity current_minus_previous, uv, up.
     """
     height, width = check_image("motion", motion, channels=2)
-    check_choice("sign", sign, _SIGNS)
-    check_choice("units", units, _UNITS)
-    check_choice("y_axis", y_axis, _Y_AXES)
+    check_choice("sign", sign, get_args(Sign))
+    check_choice("units", units, get_args(Units))
+    check_choice("y_axis", y_axis, get_args(YAxis))
     scale = {"pixels": (1.0, 1.0), "uv": (width, height), "ndc": (width / 2, height / 2)}[units]
     forward = -1.0 if sign == "current_minus_previous" else 1.0
     down = -1.0 if y_axis == "up" else 1.0
@@ -87,11 +87,24 @@ def _project(camera: Camera, points: Array, height: int, width: int) -> tuple[Ar
     view, projection = cast(Array, camera.view), cast(Array, camera.projection)  # `check_camera` has refused None
     clip = points @ (projection @ view).T
     w = clip[..., 3:]
-    ahead = w > 0
-    ndc = clip[..., :2] / jnp.where(ahead, w, 1)
+    ndc = divide(clip[..., :2], w)
     half, size = jnp.array([0.5, -0.5], ndc.dtype), jnp.array([width, height], ndc.dtype)
     half, size = (jnp.broadcast_to(a, ndc.shape) for a in (half, size))
-    return (ndc * half + 0.5) * size - 0.5, ahead
+    return (ndc * half + 0.5) * size - 0.5, w > 0
+
+
+def carried(position: Array, object_motion: Array | None, stencil: Array | None) -> tuple[Array, Array]:
+    """Finite positions as homogeneous points `[H, W, 4]`, and these moved by the matrix that the stencil picks."""
+    points = jnp.concatenate([position, jnp.ones_like(position[..., :1])], -1)
+    if object_motion is None or stencil is None:
+        return points, points
+    count, (height, width) = object_motion.shape[0], position.shape[:2]
+    ids = jnp.round(stencil[..., 0]).astype(jnp.int32)
+    known = (ids >= 0) & (ids < count)
+    matrices = take_rows(object_motion.reshape(count, 16), jnp.where(known, ids, 0)).reshape(height, width, 4, 4)
+    # not a matrix product, which some GPUs take in fewer bits
+    moved = jnp.sum(matrices * points[..., None, :], -1)
+    return points, jnp.where(known[..., None], moved, points)
 
 
 @jax.jit
@@ -110,7 +123,8 @@ def camera_motion(
 
     Args:
         position: `[H, W, 3]`, world space.
-        camera, previous_camera: of this frame and of the one before.
+        camera: of this frame.
+        previous_camera: of the frame before.
         object_motion: `[N, 4, 4]`: for each stencil id 0..N-1 the matrix from world positions now to world positions in
             the previous frame.
         stencil: `[H, W, 1]` ids that pick the matrix; ids beyond N-1 count as static. Needed with `object_motion`.
@@ -136,17 +150,10 @@ def camera_motion(
     if (object_motion is None) != (stencil is None):
         raise ValueError("object_motion, stencil: expected both or neither, got one")
     finite = jnp.all(jnp.isfinite(position), -1, keepdims=True)
-    points = jnp.where(finite, position, 0)
-    points = jnp.concatenate([points, jnp.ones_like(points[..., :1])], -1)
-    previous = points
     if object_motion is not None and stencil is not None:
-        count = check_array("object_motion", object_motion, shape=("N", 4, 4))[0]
+        check_array("object_motion", object_motion, shape=("N", 4, 4))
         check_image("stencil", stencil, size=(height, width), channels=1)
-        ids = jnp.round(stencil[..., 0]).astype(jnp.int32)
-        known = (ids >= 0) & (ids < count)
-        matrices = take_rows(object_motion.reshape(count, 16), jnp.where(known, ids, 0)).reshape(height, width, 4, 4)
-        moved = jnp.einsum("hwij,hwj->hwi", matrices, points)
-        previous = jnp.where(known[..., None], moved, points)
+    points, previous = carried(jnp.where(finite, position, 0), object_motion, stencil)
     here, ahead = _project(camera, points, height, width)
     there, ahead_before = _project(previous_camera, previous, height, width)
     return jnp.where(finite & ahead & ahead_before, there - here, jnp.nan)
@@ -160,8 +167,8 @@ def occlusion_motion(motion: Float[Array, "h w 2"], depth: Float[Array, "h w 1"]
     its own motion lands, floored and held to the frame.
 
     Args:
-        motion: `[H, W, 2]` from the target to the source frame. depth: `[H, W, 1]` of the target; what is not positive
-            is nothing, and behind all surfaces.
+        motion: `[H, W, 2]` from the target to the source frame.
+        depth: `[H, W, 1]` of the target; what is not positive is nothing, and behind all surfaces.
 
     Returns:
         `[H, W, 2]`; 0 where nothing was splatted to. A pixel that is nobody's background gets its own or a like vector.
@@ -198,14 +205,15 @@ def dilate_motion(
     motion: Float[Array, "h w 2"],
     depth: Float[Array, "h w 1"],
     *,
-    neighbours: Literal["diagonal", "cross", "square"] = "diagonal",
+    neighbours: Neighbours = "diagonal",
 ) -> Float[Array, "h w 2"]:
     """Each pixel takes the motion of the nearest in depth of itself and its neighbours.
 
     The silhouettes of moving objects then carry their antialiased edge along.
 
     Args:
-        motion: `[H, W, 2]`. depth: `[H, W, 1]`, smaller is nearer; what is not positive is nothing, and far.
+        motion: `[H, W, 2]`.
+        depth: `[H, W, 1]`, smaller is nearer; what is not positive is nothing, and far.
         neighbours: "diagonal" (four, as Unreal's engine pass), "cross" (four) or "square" (eight).
 
     Returns:
@@ -223,7 +231,7 @@ def dilate_motion(
     """
     size = check_image("motion", motion, channels=2)
     check_image("depth", depth, size=size, channels=1)
-    check_choice("neighbours", neighbours, tuple(_NEIGHBOURS))
+    check_choice("neighbours", neighbours, get_args(Neighbours))
     height, width = size
     depth = surface_depth(jax.lax.stop_gradient(depth))
     nearest = jnp.where(jnp.isnan(depth), jnp.inf, depth)

@@ -1,19 +1,17 @@
 """Radiance: demodulation by the material, logarithm, tone map, sRGB, each with its inverse."""
 
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_choice, check_image, check_present
-from jaxtrapolate.precision import widest
+from jaxtrapolate.precision import divide, widest
 from jaxtrapolate.records import GBuffer, check_gbuffer
 
 By = Literal["albedo+specular", "albedo", "none"]
-
-_BY = ("albedo+specular", "albedo", "none")
 
 
 @partial(jax.jit, static_argnames=("by",))
@@ -31,7 +29,7 @@ def demodulation_divisor(
     Raises:
         ValueError: an unknown `by`, no albedo, or with "none" no buffer at all.
     """
-    check_choice("by", by, _BY)
+    check_choice("by", by, get_args(By))
     size = check_gbuffer("gbuffer", gbuffer)
     if by == "none":
         if size is None:
@@ -62,8 +60,9 @@ def demodulate(
     there: see `jaxtrapolate.methods.hindsight`.
 
     Args:
-        color: `[H, W, 3]` linear radiance. gbuffer: with albedo; specular, metallic, sky where they are there.
-        by: "albedo+specular", "albedo", or "none" (the colour as it is).
+        color: `[H, W, 3]` linear radiance.
+        gbuffer: with albedo; specular, metallic, sky where they are there.
+        by: "albedo+specular", "albedo", or "none" (the colour unchanged).
         floor: the smallest divisor: in the dark it bounds the quotient, and noise. With 0, what reflects nothing is 0.
 
     Gradient:
@@ -80,8 +79,7 @@ def demodulate(
     if by == "none":
         return color
     divisor = demodulation_divisor(gbuffer, by=by, floor=floor).astype(color.dtype)
-    reflects = divisor > 0
-    return jnp.where(reflects, color / jnp.where(reflects, divisor, 1), 0)
+    return divide(color, divisor)
 
 
 @partial(jax.jit, static_argnames=("by",))
@@ -95,7 +93,10 @@ def modulate(
     """Radiance with the material's texture again: the inverse of `demodulate` with the same options, to 1 ulp.
 
     Args:
-        irradiance: `[H, W, 3]`, demodulated radiance. gbuffer, by, floor: as in `demodulate`.
+        irradiance: `[H, W, 3]`, demodulated radiance.
+        gbuffer: as in `demodulate`.
+        by: as in `demodulate`.
+        floor: as in `demodulate`.
 
     Returns:
         `[H, W, 3]` linear radiance.
@@ -170,8 +171,7 @@ def expand(compressed: Float[Array, "*n"]) -> Float[Array, "*n"]:
     In float32 the round trip errs by 2e-7 of 1 + x, relative: 1 % at 65504.
     """
     square = jnp.square(jnp.where(compressed > 0, compressed, 0))
-    inner = square < 1
-    return jnp.where(inner, square / jnp.where(inner, 1 - square, 1), jnp.finfo(square.dtype).max)
+    return divide(square, 1 - square, otherwise=jnp.finfo(square.dtype).max)
 
 
 @jax.jit

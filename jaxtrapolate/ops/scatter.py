@@ -5,7 +5,7 @@ Convention:
 """
 
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +15,10 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_present
 from jaxtrapolate.ops.depth import surface_depth
 from jaxtrapolate.ops.warp import landing, take_rows, weigh
-from jaxtrapolate.precision import widest
+from jaxtrapolate.precision import divide, widest
 
 Mode = Literal["sum", "average", "linear", "softmax"]
 
-_MODES = ("sum", "average", "linear", "softmax")
 _NONE = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
@@ -80,9 +79,10 @@ def splat_nearest(
 
     Args:
         values: `[H, W, C]`, what is scattered.
-        motion: `[H, W, 2]` in pixels. depth: `[H, W, 1]`, smaller is nearer; what is not positive is nothing, and as
-            far as +inf (`jaxtrapolate.ops.depth`).
-        footprint: 4, the four pixel centres around the landing place (a point that lands on a centre also covers the
+        motion: `[H, W, 2]` in pixels.
+        depth: `[H, W, 1]`, smaller is nearer; what is not positive is nothing, and as far as +inf
+            (`jaxtrapolate.ops.depth`).
+        footprint: 4, the four pixel centres around the landing position (a point that lands on a centre also covers the
             next ones right and down, as a cell of pixels does), or 1, the nearest centre (ties right and down).
 
     Returns:
@@ -160,7 +160,7 @@ def _splat(values, motion, weights, *, mode):
     if not normalised:
         return total
     summed, weight = total[..., :-1], total[..., -1:]
-    return jnp.where(weight > 0, summed / jnp.where(weight > 0, weight, 1), 0)
+    return divide(summed, weight)
 
 
 def splat(
@@ -177,7 +177,8 @@ def splat(
     "softmax": sum(b exp(z) v) / sum(b exp(z)).
 
     Args:
-        values: `[H, W, C]`. motion: `[H, W, 2]` in pixels.
+        values: `[H, W, C]`.
+        motion: `[H, W, 2]` in pixels.
         weights: `[H, W, 1]`, for "linear" (not negative) and "softmax" (any; larger is more important) only.
         mode: as above.
 
@@ -193,8 +194,8 @@ def splat(
         that no size of the weights over- or underflows there.
 
     Gradient:
-        With respect to values, motion and weights, exact away from kinks; at a landing place on a pixel centre, that of
-        the move to the right and down. 0 in holes and for what lands outside.
+        With respect to values, motion and weights, exact away from kinks; at a landing position on a pixel centre, that
+        of the move to the right and down. 0 in holes and for what lands outside.
 
     Raises:
         TypeError, ValueError: no floating-point array, a shape that does not fit, an unknown mode, or weights that are
@@ -205,7 +206,7 @@ def splat(
     """
     size = check_image("values", values)
     check_image("motion", motion, size=size, channels=2)
-    check_choice("mode", mode, _MODES)
+    check_choice("mode", mode, get_args(Mode))
     if mode in ("linear", "softmax"):
         weights = check_present("weights", weights, needed_by=f"mode={mode!r}")
         check_image("weights", weights, size=size, channels=1)

@@ -8,7 +8,7 @@ Convention:
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,7 @@ from jaxtrapolate.precision import widest
 
 Filter = Literal["nearest", "bilinear", "bicubic"]
 
-_FILTERS = ("nearest", "bilinear", "bicubic")
-_OUTSIDE = ("edge", "zero")
+Outside = Literal["edge", "zero"]
 
 
 def pixel_grid(height: int, width: int, dtype=jnp.float32) -> tuple[Float[Array, "1 w"], Float[Array, "h 1"]]:
@@ -145,18 +144,24 @@ def _nearest(product, image, x, y):
     return take_rows(image.reshape(-1, channels), row * width + column)
 
 
-def _bilinear(product, image, x, y):
+def bilinear_taps(image: Inexact[Array, "h w c"], x: Array, y: Array) -> list[tuple[Array, Array]]:
+    """The four pixels around each position `[..., C]` and their weights `[..., 1]`, row by row."""
     height, width, _ = image.shape
     column, t = cell(x, width)
     row, u = cell(y, height)
     t, u = t[..., None], u[..., None]
-    real = widest(image, x)
-    wide = jnp.result_type(image.dtype) if jnp.iscomplexobj(image) else real
     right, down = int(width > 1), int(height > 1)
     taps = take_offsets(image, row, column, [(0, 0), (0, right), (down, 0), (down, right)])
     # a (1 - t) + b t returns a tap bit for bit at t = 0 and t = 1; a + t (b - a) does not
     weights = [(1 - t) * (1 - u), t * (1 - u), (1 - t) * u, t * u]
-    a, b, c, d = (product(tap.astype(wide), weight.astype(real)) for tap, weight in zip(taps, weights, strict=False))
+    return list(zip(taps, weights, strict=True))
+
+
+def _bilinear(product, image, x, y):
+    real = widest(image, x)
+    wide = jnp.result_type(image.dtype) if jnp.iscomplexobj(image) else real
+    taps = bilinear_taps(image, x, y)
+    a, b, c, d = (product(tap.astype(wide), weight.astype(real)) for tap, weight in taps)
     return (a + b) + (c + d)
 
 
@@ -226,7 +231,7 @@ def backward_warp(
     motion: Float[ArrayLike, "i j 2"],
     *,
     filter: Filter = "bilinear",
-    outside: Literal["edge", "zero"] | int | float | Float[ArrayLike, ""] = "edge",
+    outside: Outside | int | float | Float[ArrayLike, ""] = "edge",
 ) -> Float[Array, "i j c"]:
     """The image fetched along the motion: result[p] = image(p + motion[p]).
 
@@ -247,7 +252,7 @@ def backward_warp(
     Exactness:
         Zero motion returns the image bit for bit; an integer shift returns the shifted image bit for bit (a negative
         zero may lose its sign, and a number below 2^-126 may become 0). A pixel contributes only where its weight is
-        not 0: a NaN or infinity beside a landing place on a pixel does not spread.
+        not 0: a NaN or infinity beside a displaced position on a pixel does not spread.
 
     Edge cases:
         NaN or infinite motion gives the outside value, with "edge" the pixel p itself (of the nearest place in the
@@ -267,9 +272,9 @@ def backward_warp(
     """
     check_image("image", image)
     check_image("motion", motion, channels=2)
-    check_choice("filter", filter, _FILTERS)
+    check_choice("filter", filter, get_args(Filter))
     if isinstance(outside, str):
-        check_choice("outside", outside, _OUTSIDE)
+        check_choice("outside", outside, get_args(Outside))
     fill = not (isinstance(outside, str) and outside == "edge")
     value = jnp.asarray(0.0 if isinstance(outside, str) else outside)
     return _backward_warp(image, motion, value, filter=filter, fill=fill)

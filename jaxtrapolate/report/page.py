@@ -22,10 +22,11 @@ from jaxtrapolate.report import values
 from jaxtrapolate.report.colors import CAUSE_COLORS, CAUSE_TEXTS, ERROR_LIMIT, error_gradient
 from jaxtrapolate.report.pictures import Pictures
 from jaxtrapolate.report.plots import plot_causes, plot_error_time, plot_frames
-from jaxtrapolate.report.values import DASH, MethodResult, MetricColumn, items, mapping, number
+from jaxtrapolate.report.values import DASH, MetricColumn, NamedMethod
+from jaxtrapolate.results import Results, mapping, number
 
 
-def write_report(results: Mapping[str, Any], folder: str | os.PathLike[str]) -> Path:
+def write_report(results: Results | Mapping[str, Any], folder: str | os.PathLike[str]) -> Path:
     """Writes `folder/report.html`, one self-contained page, in full or not at all.
 
     Args:
@@ -47,7 +48,7 @@ def write_report(results: Mapping[str, Any], folder: str | os.PathLike[str]) -> 
     return path
 
 
-def render_report(results: Mapping[str, Any], folder: str | os.PathLike[str]) -> str:
+def render_report(results: Results | Mapping[str, Any], folder: str | os.PathLike[str]) -> str:
     """The page as text; arguments as of `write_report`."""
     here = files("jaxtrapolate.report")
     sources = {kind: here.joinpath(f"report.{kind}").read_text(encoding="utf-8") for kind in ("html", "css", "js")}
@@ -59,23 +60,21 @@ def render_report(results: Mapping[str, Any], folder: str | os.PathLike[str]) ->
         css=Markup(sources["css"]),
         js=Markup(sources["js"]),
         script_hash=f"sha256-{digest}",
-        **_content(results, Path(folder)),
+        **_content(values.as_results(results), Path(folder)),
     )
 
 
-def _content(results: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def _content(results: Results, folder: Path) -> dict[str, Any]:
     """Everything that the template shows, as text and plain values."""
-    methods, metrics = values.read_methods(results), values.read_metrics(results)
+    methods, metrics = values.named_methods(results), values.metric_columns(results)
     best, reference = values.best_method(methods), values.reference_method(methods)
     pictures = Pictures(folder)
-    shown = [
-        _frame(entry, methods, best, reference, pictures) for entry in map(mapping, items(results.get("pictures")))
-    ]
-    notes = [str(note) for note in items(results.get("notes"))]
+    shown = [_frame(entry, methods, best, reference, pictures) for entry in results.pictures]
+    notes = list(results.notes)
     if pictures.missing:
         notes.append(f"pictures that could not be read: {', '.join(pictures.missing)}")
     return {
-        "title": str(results.get("input") or "no name"),
+        "title": results.input or "no name",
         "headline": values.headline(methods),
         "facts": _facts(results, methods),
         "best": best and best.name,
@@ -84,9 +83,9 @@ def _content(results: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         "metrics": [column.label for column in metrics],
         "frame_metrics": [column.label for column in metrics if column.per_frame],
         "inputs": _input_rows(results, methods),
-        "failed": [str(reason) for reason in mapping(results.get("failed")).values()],
+        "failed": list(results.failed.values()),
         "video": _video(results),
-        "skipped": {str(k): str(v) for k, v in mapping(results.get("skipped")).items()},
+        "skipped": dict(results.skipped),
         "causes": _causes(methods),
         "cause_rows": _cause_rows(methods),
         "stages": _stage_rows(methods),
@@ -99,28 +98,26 @@ def _content(results: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         },
         "error_limit": f"{ERROR_LIMIT:g}",
         "error_gradient": error_gradient(),
-        "machine": _flat(mapping(results.get("machine"))),
-        "settings": _flat(mapping(results.get("settings"))),
+        "machine": _flat(results.machine),
+        "settings": _flat(results.settings),
         "notes": notes,
     }
 
 
-def _facts(results: Mapping[str, Any], methods: Sequence[MethodResult]) -> list[str]:
+def _facts(results: Results, methods: Sequence[NamedMethod]) -> list[str]:
     facts = []
-    if inputs := items(results.get("inputs")):
+    if results.inputs:
         facts.append("each input counts as much as another")
-    size = [number(v) for v in items(results.get("size"))]
-    if len(size) == 2 and None not in size:
-        facts.append(f"{size[1]:g} × {size[0]:g} pixels")
-    if results.get("hdr") is not None:
-        facts.append("HDR, scored after x/(1+x) and gamma 1/2.2" if results["hdr"] else "8-bit, scored in sRGB")
-    count = len(items(results.get("frames"))) or max((len(m.frames) for m in methods), default=0)
-    count = count or sum(int(number(mapping(i).get("frames")) or 0) for i in inputs)
+    if results.size is not None:
+        facts.append(f"{results.size[1]} × {results.size[0]} pixels")
+    if results.hdr is not None:
+        facts.append("HDR, scored after x/(1+x) and gamma 1/2.2" if results.hdr else "8-bit, scored in sRGB")
+    count = len(results.frames) or max((len(m.frames) for m in methods), default=0)
+    count = count or sum(i.frames or 0 for i in results.inputs)
     if count:
         facts.append(f"{count} frame{'s' if count > 1 else ''} held back and scored")
-    device = mapping(results.get("machine"))
-    if device.get("gpu") or device.get("cpu"):
-        facts.append(str(device.get("gpu") or device.get("cpu")))
+    if device := results.machine.get("gpu") or results.machine.get("cpu"):
+        facts.append(str(device))
     return facts
 
 
@@ -132,14 +129,14 @@ def _tops(columns: Sequence[Sequence[float | None]], *, least: Sequence[int] = (
 
 def _method_rows(methods, metrics: Sequence[MetricColumn], best, reference) -> list[dict[str, Any]]:
     def row_values(m):
-        return (m.psnr, *(m.others[c.name] for c in metrics), m.ms.median)
+        return (m.psnr, *(m.metrics[c.name] for c in metrics), m.ms.median)
 
     least = [i for i, c in enumerate(metrics, 1) if not c.higher] + [len(metrics) + 1]
     tops = _tops(list(zip(*map(row_values, methods), strict=True)), least=least)
     rows = []
     for m in methods:
         marks = [top is not None and value == top for value, top in zip(row_values(m), tops, strict=True)]
-        texts = [values.metric_text(m.others[c.name], c.unit) for c in metrics]
+        texts = [values.metric_text(m.metrics[c.name], c.unit) for c in metrics]
         rows.append(
             {
                 "name": m.name,
@@ -150,42 +147,42 @@ def _method_rows(methods, metrics: Sequence[MetricColumn], best, reference) -> l
                 "others": list(zip(texts, marks[1:-1], strict=True)),
                 "ms": values.milliseconds(m.ms.median),
                 "iqr": values.milliseconds(m.ms.iqr),
-                "compile": values.duration(m.ms.compile),
+                "compile": values.duration(m.ms.compile) + (" (cached)" if m.ms.cached else ""),
                 "marks": marks,
             }
         )
     return rows
 
 
-def _occurring(methods: Sequence[MethodResult]) -> list[str]:
+def _occurring(methods: Sequence[NamedMethod]) -> list[str]:
     """The causes that occur; all of them where nothing is known."""
     return [c for c in CAUSES if any(c in m.by_cause for m in methods)] or list(CAUSES)
 
 
-def _causes(methods: Sequence[MethodResult]) -> list[dict[str, str | None]]:
+def _causes(methods: Sequence[NamedMethod]) -> list[dict[str, str | None]]:
     """The legend of the causes that occur; shares are the pixels', so any method's are everyone's."""
     legend = []
     for cause in _occurring(methods):
-        shares = [m.by_cause[cause][1] for m in methods if cause in m.by_cause and m.by_cause[cause][1] is not None]
+        shares = [s for m in methods if cause in m.by_cause and (s := m.by_cause[cause].share) is not None]
         share = values.percent(shares[0]) if shares else None
         legend.append({"name": cause, "color": CAUSE_COLORS[cause], "text": CAUSE_TEXTS[cause], "share": share})
     return legend
 
 
-def _cause_rows(methods: Sequence[MethodResult]) -> list[dict[str, Any]]:
+def _cause_rows(methods: Sequence[NamedMethod]) -> list[dict[str, Any]]:
     causes = _occurring(methods)
-    tops = _tops([[m.by_cause.get(c, (None,))[0] for m in methods] for c in causes])
+    tops = _tops([[m.psnr_of(c) for m in methods] for c in causes])
     rows = []
     for m in methods:
         if m.by_cause:
-            found = [m.by_cause.get(c, (None,))[0] for c in causes]
+            found = [m.psnr_of(c) for c in causes]
             marks = [v is not None and v == top for v, top in zip(found, tops, strict=True)]
             cells = list(zip([values.fixed(v) for v in found], marks, strict=True))
             rows.append({"name": m.name, "color": m.color, "cells": cells})
     return rows
 
 
-def _stage_rows(methods: Sequence[MethodResult]) -> list[dict[str, Any]]:
+def _stage_rows(methods: Sequence[NamedMethod]) -> list[dict[str, Any]]:
     groups = []
     for m in methods:
         total = sum(s.median or 0.0 for s in m.stages.values())
@@ -210,10 +207,10 @@ def _stage_rows(methods: Sequence[MethodResult]) -> list[dict[str, Any]]:
     return groups
 
 
-def _input_rows(results: Mapping[str, Any], methods: Sequence[MethodResult]) -> list[dict[str, Any]]:
+def _input_rows(results: Results, methods: Sequence[NamedMethod]) -> list[dict[str, Any]]:
     """dB by input and method, the best of each input marked, and a last row of their means."""
     rows = []
-    for row in values.read_inputs(results):
+    for row in values.input_rows(results):
         found = [row.psnr.get(m.name) for m in methods]
         top = _tops([found])[0]
         cells = [(values.fixed(v, 2), v is not None and v == top) for v in found]
@@ -225,13 +222,13 @@ def _input_rows(results: Mapping[str, Any], methods: Sequence[MethodResult]) -> 
     return rows
 
 
-def _video(results: Mapping[str, Any]) -> dict[str, str] | None:
+def _video(results: Results) -> dict[str, str] | None:
     """The link to the video."""
-    link = values.relative_link(results.get("video"))
-    return {"link": link, "name": str(results["video"])} if link else None
+    link = values.relative_link(results.video)
+    return {"link": link, "name": str(results.video)} if link else None
 
 
-def _score_table(methods: Sequence[MethodResult], metrics: Sequence[MetricColumn]) -> list[dict[str, Any]]:
+def _score_table(methods: Sequence[NamedMethod], metrics: Sequence[MetricColumn]) -> list[dict[str, Any]]:
     scores = {(m.name, f.number): f for m in methods for f in m.frames}
     rows = []
     for index in sorted({f.number for m in methods for f in m.frames}):
@@ -239,7 +236,7 @@ def _score_table(methods: Sequence[MethodResult], metrics: Sequence[MetricColumn
         cells = [
             (
                 values.fixed(f and f.psnr, 2),
-                *(values.metric_text(f and f.others[c.name], c.unit) for c in metrics),
+                *(values.metric_text(f and f.metrics[c.name], c.unit) for c in metrics),
                 values.milliseconds(f and f.ms),
             )
             for f in found

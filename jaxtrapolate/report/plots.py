@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import matplotlib
-import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
@@ -22,7 +21,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from matplotlib.transforms import Bbox, BboxBase
 
 from jaxtrapolate.ops.causes import CAUSES
-from jaxtrapolate.report.values import MethodResult, fixed, percent, read_methods
+from jaxtrapolate.report.values import NamedMethod, fixed, named_methods, percent
+from jaxtrapolate.results import Results
 
 _INK, _SOFT, _GRID = "#24292e", "#59616a", "#d5d9dd"
 _DARK = {_INK: "#e8ebee", _SOFT: "#a5adb6", _GRID: "#3a4149"}
@@ -30,9 +30,10 @@ _FONT = "DejaVu Sans"
 _WIDTH = 5.4
 _LOCK = threading.Lock()
 
-_OFFSETS = ((9, 0), (-9, 0), (0, 9), (0, -9), (7, 7), (7, -7), (-7, 7), (-7, -7))
-_NEAR = len(_OFFSETS)
-_OFFSETS += ((24, 20), (24, -20), (-24, 20), (-24, -20), (0, 28), (0, -28), (34, -36), (-34, 36))
+_NEAR = 9  # points from a point's centre to a label beside it
+_RINGS = (_NEAR, 16, 26, 38, 52, 68, 88, 112, 140, 175, 215, 260)  # points, where labels are tried
+_DIRECTIONS = 16
+_MOST_LABELS = 24
 
 
 def _style_sheet() -> str:
@@ -76,14 +77,21 @@ def _labels(axes: Any, x: str, y: str) -> None:
     axes.set_ylabel(y, color=_INK, fontsize=10.5)
 
 
-def _nothing(figure: Figure, axes: Any, text: str) -> bytes:
+def _say(axes: Any, text: str) -> None:
     axes.set_axis_off()
     axes.text(0.5, 0.5, text, color=_SOFT, fontsize=11, ha="center", va="center", transform=axes.transAxes)
+
+
+def _nothing(figure: Figure, axes: Any, text: str) -> bytes:
+    _say(axes, text)
     return _svg(figure)
 
 
-def _legend(figure: Figure, methods: Sequence[MethodResult], *, line: Literal["-", "none"]) -> None:
-    """One entry a method above the axes. Names may hold any sign, so the labels are set afterwards, as plain text."""
+def _legend(figure: Figure, methods: Sequence[NamedMethod], *, line: Literal["-", "none"]) -> int:
+    """One entry a method above the axes; returns in how many rows.
+
+    Names may hold any sign, so the labels are set afterwards, as plain text.
+    """
     handles = [Line2D([], [], color=m.color, marker=m.marker, markersize=6, linestyle=line) for m in methods]
     fitting = max(1, int(66 / (max(len(_drawable(m.name)) for m in methods) + 5)))
     columns = math.ceil(len(methods) / math.ceil(len(methods) / fitting))
@@ -92,6 +100,7 @@ def _legend(figure: Figure, methods: Sequence[MethodResult], *, line: Literal["-
     )
     for text, method in zip(legend.get_texts(), methods, strict=True):
         text.set(text=_drawable(method.name), color=_INK, parse_math=False)
+    return math.ceil(len(methods) / columns)
 
 
 def _ceiling(values: Sequence[float]) -> tuple[list[float], float | None]:
@@ -113,50 +122,105 @@ def _pareto(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     return front
 
 
+def _candidates(width: float, height: float) -> list[tuple[float, float, float]]:
+    """Where a label of a size may have its lower left corner, relative to its point, and how far off that is."""
+    places = []
+    for radius in _RINGS:
+        for i in sorted(range(_DIRECTIONS), key=lambda i: (i % 4 > 0, i % 2)):  # beside, above and below before askew
+            angle = 2 * math.pi * i / _DIRECTIONS
+            x, y = (round(f(angle), 9) for f in (math.cos, math.sin))
+            # the label's nearest edge or corner is on the ring
+            left = radius * x - (0.5 if x == 0 else float(x < 0)) * width
+            low = radius * y - (0.5 if y == 0 else float(y < 0)) * height
+            places.append((left, low, float(radius)))
+    return sorted(places, key=lambda place: place[2])
+
+
 def _place_labels(
     figure: Figure,
     axes: Any,
     points: Sequence[tuple[float, float]],
     texts: Sequence[str],
     stairs: Sequence[tuple[float, float]],
-) -> None:
-    """A label beside each point, on the side where it covers least of other points and labels and of the stairs."""
+) -> list[Any] | None:
+    """A label near each point, inside the axes, over no point and no other label; the crowded ones choose first.
+
+    Of the free places the nearest is taken, but rather none over the stairs, or with a leader through a label. `None`,
+    and no label, where there are too many for all to have a place.
+    """
     renderer = FigureCanvasAgg(figure).get_renderer()
     figure.draw_without_rendering()
     inner = axes.get_window_extent(renderer)
-    centers = [axes.transData.transform(point) for point in points]
-    taken = [Bbox.from_bounds(x - 10, y - 8, 20, 16) for x, y in centers]
+    unit = figure.dpi / 72
+    centers = [tuple(axes.transData.transform(point)) for point in points]
+    marks = [Bbox.from_bounds(x - 5 * unit, y - 5 * unit, 10 * unit, 10 * unit) for x, y in centers]
     corners_of_stairs = axes.transData.transform(stairs)
     lines = []
     for (left, low), (right, high) in itertools.pairwise(corners_of_stairs):
         lines += [Bbox([[left, low - 2], [right, low + 2]]), Bbox([[right - 2, low], [right + 2, high]])]
-    for index, (point, text) in enumerate(zip(points, texts, strict=True)):
-        best: tuple[float, Any, Any] = (math.inf, None, None)
-        for order, (dx, dy) in enumerate(_OFFSETS):
-            align = {"ha": ("center", "left", "right")[np.sign(dx)], "va": ("center", "bottom", "top")[np.sign(dy)]}
-            leader = {"arrowstyle": "-", "color": _SOFT, "linewidth": 0.7} if order >= _NEAR else None
-            label = axes.annotate(
-                text, point, (dx, dy), textcoords="offset points", color=_INK, fontsize=10, arrowprops=leader, **align
-            )
-            label.set(parse_math=False, in_layout=False)
-            label.update_positions(renderer)
-            box = Text.get_window_extent(label, renderer)  # without the leader
-            outside = box.width * box.height - _overlap(box, inner)
-            covered = sum(_overlap(box, other) for i, other in enumerate(taken) if i != index)
-            cost = (
-                covered
-                + 2 * outside
-                + sum(_overlap(box, line) for line in lines)
-                + (20 if leader else 0)
-                + 1e-3 * order
-            )
+    order = sorted(range(len(points)), key=lambda i: _room(centers, i))
+    if len(points) > _MOST_LABELS:
+        return None
+    labels: dict[int, Any] = {}
+    boxes: list[Bbox] = []
+    leaders: list[tuple[Any, Any]] = []
+    for index in order:
+        x, y = centers[index]
+        label = axes.annotate(
+            texts[index], points[index], (0, 0), textcoords="offset points", color=_INK, fontsize=10, ha="left"
+        )
+        label.set(parse_math=False, in_layout=False, va="bottom")
+        labels[index] = label
+        size = Text.get_window_extent(label, renderer)
+        best: tuple[float, tuple[float, float] | None, Bbox, float] = (math.inf, None, size, 0.0)
+        for left, low, radius in _candidates(size.width / unit, size.height / unit):
+            if radius >= best[0]:
+                break  # all others are further off
+            box = Bbox.from_bounds(x + left * unit, y + low * unit, size.width, size.height)
+            near = box.expanded(1 + 2 * unit / box.width, 1 + 2 * unit / box.height)
+            if _overlap(box, inner) < 0.999 * box.width * box.height:
+                continue
+            if any(_overlap(near, other) for other in (*marks, *boxes)):
+                continue
+            if any(_crosses(box, *leader) for leader in leaders):
+                continue
+            far = radius > _NEAR
+            through = far and any(_crosses(other, (x, y), _nearest(box, x, y)) for other in boxes)
+            cost = radius + 0.15 * sum(_overlap(box, line) for line in lines) / unit**2 + 150 * through
             if cost < best[0]:
-                if best[1] is not None:
-                    best[1].remove()
-                best = (cost, label, box)
-            else:
-                label.remove()
-        taken.append(best[2])
+                best = (cost, (left, low), box, radius)
+        if best[1] is None:
+            for other in labels.values():
+                other.remove()
+            return None
+        label.set_position(best[1])
+        boxes.append(best[2])
+        if best[3] > _NEAR:
+            end = _nearest(best[2], x, y)
+            leaders.append(((x, y), end))
+            shift = ((end[0] - x) / unit, (end[1] - y) / unit)
+            arrow = {"arrowstyle": "-", "color": _SOFT, "linewidth": 0.7, "shrinkA": 0, "shrinkB": 4}
+            line = axes.annotate(
+                "", points[index], shift, textcoords="offset points", arrowprops=arrow, annotation_clip=False
+            )
+            line.set(in_layout=False)
+    return [labels[i] for i in range(len(points))]
+
+
+def _room(centers: Sequence[tuple[float, float]], index: int) -> float:
+    """How far a point is from the nearest other one."""
+    return min((math.dist(centers[index], c) for i, c in enumerate(centers) if i != index), default=math.inf)
+
+
+def _nearest(box: Bbox, x: float, y: float) -> tuple[float, float]:
+    """The point of a box that is nearest to another."""
+    return min(max(x, box.x0), box.x1), min(max(y, box.y0), box.y1)
+
+
+def _crosses(box: Bbox, start: tuple[float, float], end: tuple[float, float]) -> bool:
+    """Whether a line from one point to another runs through a box."""
+    steps = (i / 32 for i in range(33))
+    return any(box.contains(s * end[0] + (1 - s) * start[0], s * end[1] + (1 - s) * start[1]) for s in steps)
 
 
 def _overlap(first: BboxBase, second: BboxBase) -> float:
@@ -171,23 +235,26 @@ def _isolated(function: Any, *arguments: Any) -> bytes:
         return function(*arguments)
 
 
-def plot_error_time(results: Mapping[str, Any]) -> bytes:
+def plot_error_time(results: Results | Mapping[str, Any]) -> bytes:
     """dB against milliseconds a frame (logarithmic), a labelled point for each method, and the Pareto front.
 
     On the front are the methods that no other beats in both. Infinite dB are drawn above the others and labelled so;
-    methods without dB or time are not drawn.
+    methods without dB or time are not drawn. Labels cover neither points nor each other; where they are too many for
+    that, a legend takes their place.
 
     Returns:
         SVG, UTF-8.
     """
-    return _isolated(_error_time, read_methods(results))
+    return _isolated(lambda methods: _svg(_error_time(methods)[0]), named_methods(results))
 
 
-def _error_time(methods: Sequence[MethodResult]) -> bytes:
+def _error_time(methods: Sequence[NamedMethod]) -> tuple[Figure, list[Any]]:
+    """The figure, and its labels: none where a legend says which point is whose."""
     figure, axes = _axes(3.8)
     known = [(m, m.psnr, m.ms.median) for m in methods if m.psnr is not None and m.ms.median]
     if not known:
-        return _nothing(figure, axes, "no method with both dB and run time")
+        _say(axes, "no method with both dB and run time")
+        return figure, []
     drawn = [method for method, _, _ in known]
     heights, _ = _ceiling([psnr for _, psnr, _ in known])
     times = [time for _, _, time in known]
@@ -210,28 +277,31 @@ def _error_time(methods: Sequence[MethodResult]) -> bytes:
     _labels(axes, "milliseconds a frame (median, log)", "PSNR, dB")
     texts = [_drawable(m.name) + (f" ({fixed(psnr)} dB)" if math.isinf(psnr) else "") for m, psnr, _ in known]
     axes.set_title("dashed: Pareto front", loc="right", color=_SOFT, fontsize=8.5, pad=4)
-    _place_labels(figure, axes, points, texts, stairs)
-    return _svg(figure)
+    labels = _place_labels(figure, axes, points, texts, stairs)
+    if labels is None:
+        rows = _legend(figure, drawn, line="none")
+        figure.set_figheight(figure.get_figheight() + 0.2 * rows)
+    return figure, labels or []
 
 
-def plot_causes(results: Mapping[str, Any]) -> bytes:
+def plot_causes(results: Results | Mapping[str, Any]) -> bytes:
     """dB by cause: a row for each cause that occurs, with its share of the pixels, and a mark for each method.
 
     Returns:
         SVG, UTF-8.
     """
-    return _isolated(_causes, read_methods(results))
+    return _isolated(_causes, named_methods(results))
 
 
-def _causes(methods: Sequence[MethodResult]) -> bytes:
-    drawn = [m for m in methods if any(value is not None for value, _ in m.by_cause.values())]
-    causes = [c for c in CAUSES if any(m.by_cause.get(c, (None,))[0] is not None for m in drawn)]
+def _causes(methods: Sequence[NamedMethod]) -> bytes:
+    drawn = [m for m in methods if any(m.psnr_of(c) is not None for c in CAUSES)]
+    causes = [c for c in CAUSES if any(m.psnr_of(c) is not None for m in drawn)]
     if not causes:
         return _nothing(*_axes(1.6), "no dB by cause")
     figure, axes = _axes(0.42 * len(causes) + 1.0 + 0.12 * len(drawn))
-    placed, top = _ceiling([v for m in drawn for c in causes if (v := m.by_cause.get(c, (None,))[0]) is not None])
+    placed, top = _ceiling([v for m in drawn for c in causes if (v := m.psnr_of(c)) is not None])
     heights = iter(placed)
-    marks = {(m.name, c): next(heights) for m in drawn for c in causes if m.by_cause.get(c, (None,))[0] is not None}
+    marks = {(m.name, c): next(heights) for m in drawn for c in causes if m.psnr_of(c) is not None}
     for row, cause in enumerate(causes):
         found = [marks[m.name, cause] for m in drawn if (m.name, cause) in marks]
         axes.plot([min(found), max(found)], [row, row], color=_SOFT, linewidth=1.2, zorder=2)
@@ -243,7 +313,7 @@ def _causes(methods: Sequence[MethodResult]) -> bytes:
         )
     names = []
     for cause in causes:
-        shares = [s for m in drawn if (s := m.by_cause.get(cause, (None, None))[1]) is not None]
+        shares = [s for m in drawn if cause in m.by_cause and (s := m.by_cause[cause].share) is not None]
         names.append(f"{cause}, {percent(shares[0])}" if shares else cause)
     axes.set_yticks(range(len(causes)), names)
     axes.set_ylim(len(causes) - 0.5, -0.5)
@@ -254,16 +324,16 @@ def _causes(methods: Sequence[MethodResult]) -> bytes:
     return _svg(figure)
 
 
-def plot_frames(results: Mapping[str, Any]) -> bytes:
+def plot_frames(results: Results | Mapping[str, Any]) -> bytes:
     """dB over the scored frames, a line for each method; a gap where a frame has none.
 
     Returns:
         SVG, UTF-8.
     """
-    return _isolated(_frames, read_methods(results))
+    return _isolated(_frames, named_methods(results))
 
 
-def _frames(methods: Sequence[MethodResult]) -> bytes:
+def _frames(methods: Sequence[NamedMethod]) -> bytes:
     figure, axes = _axes(3.4)
     drawn = [m for m in methods if any(f.psnr is not None for f in m.frames)]
     if not drawn:

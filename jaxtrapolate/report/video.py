@@ -43,7 +43,7 @@ def side_by_side(pictures: Sequence[UInt8[np.ndarray, "h w 3"]], labels: Sequenc
     """Pictures of one size in as many columns as keep them largest within 1920 x 1080, a label above each.
 
     Args:
-        pictures: `[H, W, 3]`, uint8. Large ones are made smaller; ones too small for a label are magnified by a whole
+        pictures: `[H, W, 3]`, uint8. Large ones are scaled down; ones too small for a label are magnified by a whole
             factor.
         labels: one each.
 
@@ -79,7 +79,8 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[Image.Image], *, 
 
     Args:
         path: ends in .webp, .gif (256 colours, a hundredth of a second at the least) or .mp4 (needs imageio-ffmpeg).
-        frames: RGB images of one even size, `count` of them, at least one.
+        frames: RGB images of one even size.
+        count: how many they are, at least one.
         fps: frames a second.
 
     Raises:

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtrapolate.runtime.memory import memory_kept
 
 _SETTINGS = ("XLA_", "JAX_", "OMP_", "MKL_", "OPENBLAS_", "NUMBA_", "MALLOC_", "GLIBC_TUNABLES", "LD_PRELOAD")
+_CACHES = ("JAX_COMPILATION_CACHE_", "JAX_PERSISTENT_CACHE_")  # change no time but that of compilation, which says so
 _FOLDERS = re.compile(r"[^\s=:]*/")
 
 
@@ -82,7 +83,8 @@ def measure_pairs(
     Args:
         functions: of no arguments. A `functools.partial` of a jitted function is lowered and compiled, which is timed
             apart; all its arguments must then be arrays (or trees of them).
-        repeats: rounds that count. warmup: rounds before them that do not.
+        repeats: rounds that count.
+        warmup: rounds before them that do not.
         calls: calls in a row that make one run, before their results are waited for. More than one hides what it costs
             to start a call on an asynchronous device.
 
@@ -157,6 +159,11 @@ def _driver() -> str | None:
     return answer[0] if answer else None
 
 
+def _counts(variable: str) -> bool:
+    """Whether a variable of the environment changes run times."""
+    return variable.startswith(_SETTINGS) and not variable.startswith(_CACHES)
+
+
 def machine() -> dict[str, Any]:
     """What a figure depends on: processor, memory, system, versions, devices, thread and allocator settings.
 
@@ -183,5 +190,5 @@ def machine() -> dict[str, Any]:
         "gpu": device.device_kind if on_gpu else None,
         "gpu_driver": _driver() if on_gpu else None,
         "memory_kept": memory_kept(),
-        "settings": {k: _FOLDERS.sub("", v) for k, v in sorted(os.environ.items()) if k.startswith(_SETTINGS)},
+        "settings": {k: _FOLDERS.sub("", v) for k, v in sorted(os.environ.items()) if _counts(k)},
     }

@@ -230,7 +230,7 @@ def _traced(
 ) -> Vector:
     """`_bounce` where the surface is smooth enough for it to count, 0 elsewhere: packs of such pixels, one by one.
 
-    What a pack reads and makes is gathered and scattered; a frame without a mirror costs nothing.
+    What a pack reads and writes is gathered and scattered; a frame without a mirror costs nothing.
     """
     shape = s.width.shape
     total = math.prod(shape)
@@ -351,10 +351,28 @@ def _render(
             "motion": (there.x - here.x, there.y - here.y),
         }
 
-    made = planes(s, hit.t, d, color, shadow)
-    motion = jnp.stack(made.pop("motion"), axis=-1)
-    gbuffer = {name: v.stack() if isinstance(v, Vector) else v[..., None] for name, v in made.items()}
-    return Frame(color.stack(), GBuffer(**gbuffer), motion, matrices(view, size), jitter, time)
+    buffers = planes(s, hit.t, d, color, shadow)
+    motion = jnp.stack(buffers.pop("motion"), axis=-1)
+    gbuffer = {name: v.stack() if isinstance(v, Vector) else v[..., None] for name, v in buffers.items()}
+    objects = _object_motion(scene, poses)
+    return Frame(color.stack(), GBuffer(**gbuffer), motion, matrices(view, size), jitter, time, objects)
+
+
+def _object_motion(scene: Scene, poses: tuple[Pose, Pose]) -> Array | None:
+    """The map of the world now to that of the previous frame, `[N, 4, 4]`, for the ids 1 to N of the stencil.
+
+    An object of several bodies has that of the first of them, the one that the others hang on. `None` where a scene has
+    no bodies.
+    """
+    if len(scene.bodies.parents) == 1:
+        return None
+    now, before = poses
+    moved = before.compose(now.inverse())
+    ids = scene.bodies.stencil
+    first = jnp.argmax(ids[None, :] == jnp.arange(1, len(scene.bodies.parents), dtype=ids.dtype)[:, None], axis=1)
+    top = jnp.concatenate([moved.rotation[first], moved.translation[first][..., None]], axis=-1)
+    last = jnp.broadcast_to(jnp.asarray([0, 0, 0, 1], top.dtype), (*top.shape[:1], 1, 4))
+    return jnp.concatenate([top, last], axis=-2)
 
 
 @functools.partial(jax.jit, static_argnames=("size",))

@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtrapolate.files.sequence import MotionConvention, Sequence
@@ -21,6 +22,10 @@ class SceneSequence(Sequence):
         size: `(H, W)`.
         first: number and time of the first frame.
         samples: colour samples a pixel.
+        jittered: whether the samples of each frame are shifted by a fraction of a pixel, another one each frame: by
+            `jitter_of` its number.
+        scale: how many times larger the frames of `larger` are in each direction; 1 for none.
+        larger_samples: colour samples a pixel of those.
     """
 
     def __init__(
@@ -32,7 +37,12 @@ class SceneSequence(Sequence):
         *,
         first: int = 0,
         samples: int = 1,
+        jittered: bool = False,
+        scale: int = 1,
+        larger_samples: int = 16,
     ) -> None:
+        if scale < 1:
+            raise ValueError(f"scale: expected at least 1, got {scale}")
         if frames < 1:
             raise ValueError(f"frames: expected at least 1, got {frames}")
         self.scene = scene(name, seed)
@@ -43,16 +53,20 @@ class SceneSequence(Sequence):
         self.convention = MotionConvention()
         self.depth = "metric"
         self.forward_motion = True
-        self.samples = samples
+        self.samples, self.jittered = samples, jittered
+        if scale > 1:
+            size = self.size[0] * scale, self.size[1] * scale
+            self.larger = SceneSequence(name, seed, frames, size, first=first, samples=larger_samples)
 
     def identity(self) -> dict[str, Any]:
         """The samples a pixel, beside what all sequences have; the name holds the seed."""
-        return super().identity() | {"samples": self.samples}
+        return super().identity() | {"samples": self.samples, "jittered": self.jittered}
 
     def frame(self, number: int) -> Frame:
         """The frame with every buffer."""
         self._check(number)
-        return _arrays(render(self.scene, float(number), size=self.size, samples=self.samples))
+        jitter = jnp.asarray(jitter_of(number)) if self.jittered else None
+        return _arrays(render(self.scene, float(number), size=self.size, samples=self.samples, jitter=jitter))
 
     def stored_motion(self, number: int) -> np.ndarray:
         """The frame's motion, which is in the library's own convention."""
@@ -71,6 +85,19 @@ class SceneSequence(Sequence):
     def _check(self, number: int) -> None:
         if number not in self.numbers:
             raise ValueError(f"number: expected {self.numbers[0]} to {self.numbers[-1]}, got {number}")
+
+
+def jitter_of(number: int) -> np.ndarray:
+    """The jitter `[2]` of a frame in pixels, -1/2 to 1/2: the first 16 Halton points of bases 2 and 3, in turn."""
+    index, found = number % 16 + 1, []
+    for base in (2, 3):
+        value, rest, digit = 0.0, index, 1.0
+        while rest:
+            digit /= base
+            value += digit * (rest % base)
+            rest //= base
+        found.append(value - 0.5)
+    return np.asarray(found, np.float32)
 
 
 def _arrays(value: R) -> R:

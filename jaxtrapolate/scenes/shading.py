@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxtrapolate.precision import divide
 from jaxtrapolate.records import record
 from jaxtrapolate.scenes import textures
 from jaxtrapolate.scenes.casting import Hit, Placed, light_visibility, stage
@@ -266,8 +267,7 @@ def direct_light(
             to = Vector(where[k, 0], where[k, 1], where[k, 2]) - s.position
             falloff = levels[k] / jnp.maximum(to.dot(to), 0.01)
             add(to, lights.lamp_color[k], falloff, near=True, softness=lights.lamp_radius[k])
-    lit = with_static > 1e-6
-    shadow = jnp.where(lit, 1 - with_all / jnp.where(lit, with_static, 1.0), 0.0)
+    shadow = 1 - divide(with_all, with_static, where=with_static > 1e-6, otherwise=1)
     return total, jnp.clip(shadow, 0.0, 1.0)
 
 

@@ -6,7 +6,7 @@ A file holds the fields of `Config`; the table `[options]` those of the task's o
     steps = 100000
 
     [optimizer]
-    learning_rate = 1e-3
+    peak_learning_rate = 1e-3
 
     [options]
     crop = [128, 128]
@@ -15,17 +15,14 @@ A file holds the fields of `Config`; the table `[options]` those of the task's o
 import dataclasses
 import os
 import tomllib
-import types
-import typing
 from collections.abc import Mapping
 from importlib import resources
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 from jaxtrapolate.errors import InputError
+from jaxtrapolate.files.tables import parse
 from jaxtrapolate.files.text import read_toml
 from jaxtrapolate.training.tasks import Task, find_task
-
-T = TypeVar("T")
 
 Precision = Literal["float32", "bfloat16"]
 
@@ -35,7 +32,7 @@ class Optimizer:
     """Adam and the course of its learning rate: linear warm-up, constant, then half a cosine.
 
     Attributes:
-        learning_rate: at its height.
+        peak_learning_rate: between warm-up and decay.
         warmup: steps in which it rises linearly from 0.
         constant: steps at its height after that.
         decay: steps from there to the end of the cosine, which a run may stop short of; by default the rest of the run.
@@ -45,7 +42,7 @@ class Optimizer:
         clip: the gradient's largest norm, over all weights; not clipped where absent.
     """
 
-    learning_rate: float = 1e-3
+    peak_learning_rate: float = 1e-3
     warmup: int = 0
     constant: int = 0
     decay: int | None = None
@@ -57,7 +54,7 @@ class Optimizer:
     clip: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("learning_rate", "epsilon"):
+        for name in ("peak_learning_rate", "epsilon"):
             check_range(self, name, above=0)
         for name in ("warmup", "constant", "weight_decay"):
             check_range(self, name, least=0)
@@ -82,11 +79,11 @@ class Config:
         start: a file of weights, or a run's `model` folder, that the network begins with, or "default" for the weights
             that come with the package; at random where absent. The optimiser begins anew.
         batch: items a step, over all devices.
-        pool: examples that are made at a time, a multiple of `batch`.
+        pool: examples that are generated at a time, a multiple of `batch`.
         steps_per_round: steps between one pool and the next.
         optimizer: see `Optimizer`.
-        average: decay a step of the average of the weights that is validated and exported; the weights themselves where
-            absent.
+        ema_decay: of the exponential moving average of the weights, which is validated and exported; the weights
+            themselves where absent.
         precision: of the network while training; weights, averages and validation stay float32.
         log_every: steps from one line of the log to the next, the only times at which the host waits for the devices.
         checkpoint_every, validate_every: steps, multiples of `log_every`.
@@ -102,7 +99,7 @@ class Config:
     pool: int = 64
     steps_per_round: int = 64
     optimizer: Optimizer = dataclasses.field(default_factory=Optimizer)
-    average: float | None = None
+    ema_decay: float | None = None
     precision: Precision = "float32"
     log_every: int = 50
     checkpoint_every: int = 500
@@ -113,8 +110,8 @@ class Config:
         for name in ("steps", "batch", "pool", "steps_per_round", "log_every", "keep"):
             check_range(self, name, least=1)
         check_range(self, "seed", least=0, below=2**32)
-        if self.average is not None:
-            check_range(self, "average", least=0, below=1)
+        if self.ema_decay is not None:
+            check_range(self, "ema_decay", least=0, below=1)
         if self.pool % self.batch:
             raise ValueError(f"pool: expected a multiple of batch = {self.batch}, got {self.pool}")
         for name in ("checkpoint_every", "validate_every"):
@@ -149,60 +146,6 @@ def check_range(
         raise ValueError(f"{name}: expected {' and '.join(f'{t} {b}' for t, b in given.items())}, got {value}")
 
 
-def parse(cls: type[T], table: Mapping[str, Any], *, where: str = "") -> T:
-    """A frozen dataclass from a table of plain values, whose names and types must fit; `where` is the table's name.
-
-    Integers stand for real numbers, arrays for tuples, tables for dataclasses; a field that may be `None` is left out.
-
-    Raises:
-        ValueError: one line that names the key, what was expected, and what is there.
-    """
-    prefix = f"{where}." if where else ""
-    fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    for key in table:
-        if key not in fields:
-            raise ValueError(f"{prefix}{key}: no such setting; there are {', '.join(fields) or 'none'}")
-    hints = typing.get_type_hints(cls)
-    values = {key: _convert(hints[key], value, f"{prefix}{key}") for key, value in table.items()}
-    needed = (f for f in fields.values() if f.name not in values)
-    for field in needed:
-        if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            raise ValueError(f"{prefix}{field.name}: missing; it has no default")
-    try:
-        return cls(**values)
-    except ValueError as error:
-        raise ValueError(f"{prefix}{error}") from None
-
-
-def _convert(hint: Any, value: Any, where: str) -> Any:
-    """A plain value as what a type hint asks for."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if hint is Any:
-        return value
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        if not isinstance(value, Mapping):
-            raise ValueError(f"{where}: expected a table, got {value!r}")
-        return parse(hint, value, where=where)
-    if origin in (typing.Union, types.UnionType):
-        (hint,) = (a for a in arguments if a is not type(None))  # optional; TOML has no null
-        return _convert(hint, value, where)
-    if origin is Literal:
-        if value not in arguments or isinstance(value, bool):
-            raise ValueError(f"{where}: expected one of {', '.join(map(repr, arguments))}, got {value!r}")
-        return value
-    if origin is tuple:
-        repeated = len(arguments) == 2 and arguments[1] is Ellipsis
-        if not isinstance(value, list | tuple) or not (repeated or len(value) == len(arguments)):
-            raise ValueError(f"{where}: expected an array{'' if repeated else f' of {len(arguments)}'}, got {value!r}")
-        each = [arguments[0]] * len(value) if repeated else arguments
-        return tuple(_convert(a, v, f"{where}[{i}]") for i, (a, v) in enumerate(zip(each, value, strict=True)))
-    names = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
-    accepted: Any = (int, float) if hint is float else hint
-    if isinstance(value, bool) is not (hint is bool) or not isinstance(value, accepted):
-        raise ValueError(f"{where}: expected {names[hint]}, got {value!r}")
-    return float(value) if hint is float else value
-
-
 def parse_config(table: Mapping[str, Any]) -> Config:
     """A `Config` from a table, its options by the task that it names. Raises `ValueError` as `parse` does."""
     name = table.get("task")
@@ -211,8 +154,8 @@ def parse_config(table: Mapping[str, Any]) -> Config:
     options = table.get("options", {})
     if not isinstance(options, Mapping):
         raise ValueError(f"options: expected a table, got {options!r}")
-    made = parse(find_task(name).options, options, where="options")
-    return parse(Config, {**table, "options": made})
+    parsed = parse(find_task(name).options, options, where="options")
+    return parse(Config, {**table, "options": parsed})
 
 
 def load_config(name: str | os.PathLike[str], changes: Mapping[str, Any] | None = None) -> Config:

@@ -5,22 +5,21 @@ holes. Sums are taken in at least float32.
 
 Non-finite values:
     A value of the target that is not finite counts nowhere, and has no gradient: there is nothing to learn from it. A
-    prediction that is not finite where the target is makes the loss NaN or infinite, so that a training run sees it.
+    prediction that is not finite where the target is gives a loss that is NaN or infinite, so that a training run sees
+    it.
 """
 
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_array, check_choice, check_image
-from jaxtrapolate.precision import widest
+from jaxtrapolate.precision import divide, widest
 
 Shade = Literal["release", "paper"]
-
-_SHADES = ("release", "paper")
 
 
 def _difference(prediction, target):
@@ -42,17 +41,13 @@ def _count(chosen, like, axis=None):
     return jnp.sum(chosen, axis, dtype=like.dtype)
 
 
-def _share(total, count):
-    """total / count, 0 where the count is 0."""
-    return jnp.where(count > 0, total / jnp.where(count > 0, count, 1), 0)
-
-
 @jax.jit
 def l1_loss(prediction: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Float[Array, ""]:
     """The mean absolute difference.
 
     Args:
-        prediction, target: `[H, W, C]`.
+        prediction: `[H, W, C]`.
+        target: the ground truth, of the same shape.
 
     Returns:
         A scalar; 0 where nothing counts. The gradient is the sign of the difference over the count, 0 where it is 0.
@@ -64,7 +59,7 @@ def l1_loss(prediction: Float[Array, "h w c"], target: Float[Array, "h w c"]) ->
         Guo et al. 2021 (ExtraNet), eq. 4, taken over pixels and channels as in the release.
     """
     difference, finite = _difference(prediction, target)
-    return _share(jnp.sum(_absolute(difference)), _count(finite, difference))
+    return divide(jnp.sum(_absolute(difference)), _count(finite, difference))
 
 
 @jax.jit
@@ -77,7 +72,8 @@ def charbonnier_loss(
     """The mean of sqrt(d^2 + epsilon^2): the absolute difference, smooth where it is small.
 
     Args:
-        prediction, target: `[H, W, C]`.
+        prediction: `[H, W, C]`.
+        target: the ground truth, of the same shape.
         epsilon: where it bends, in units of the images.
 
     Returns:
@@ -92,7 +88,7 @@ def charbonnier_loss(
     """
     difference, finite = _difference(prediction, target)
     values = jnp.hypot(difference, jnp.asarray(epsilon, difference.dtype))  # also where a square would overflow
-    return _share(jnp.sum(jnp.where(finite, values, 0)), _count(finite, difference))
+    return divide(jnp.sum(jnp.where(finite, values, 0)), _count(finite, difference))
 
 
 @jax.jit
@@ -102,7 +98,8 @@ def hole_loss(
     """The mean absolute difference in holes.
 
     Args:
-        prediction, target: `[H, W, C]`.
+        prediction: `[H, W, C]`.
+        target: the ground truth, of the same shape.
         mask: `[H, W, 1]`, 1 = valid, 0 = hole; values between count in part.
 
     Returns:
@@ -122,7 +119,7 @@ def hole_loss(
     check_array("mask", mask, shape=(*difference.shape[:2], 1))
     weight = jnp.where(finite, 1 - mask.astype(difference.dtype), 0)
     error = _absolute(jnp.where(weight > 0, difference, 0))  # so that what is valid does not count, whatever it holds
-    return _share(jnp.sum(weight * error), jnp.sum(weight))
+    return divide(jnp.sum(weight * error), jnp.sum(weight))
 
 
 @partial(jax.jit, static_argnames=("shade",))
@@ -136,7 +133,8 @@ def shading_loss(
     """The mean of the largest absolute differences, the tenth of a frame where its shading may have changed.
 
     Args:
-        prediction, target: `[H, W, C]`.
+        prediction: `[H, W, C]`.
+        target: the ground truth, of the same shape.
         shade: "release": the largest in each channel, and the mean over channels; "paper": the pixels whose mean over
             channels is the largest.
         fraction: of the pixels whose target is finite (of channels at "release", in all channels at "paper"); rounded
@@ -155,7 +153,7 @@ def shading_loss(
     References:
         Guo et al. 2021 (ExtraNet), eq. 6.
     """
-    check_choice("shade", shade, _SHADES)
+    check_choice("shade", shade, get_args(Shade))
     difference, finite = _difference(prediction, target)
     error = _absolute(difference)
     if shade == "paper":
@@ -186,10 +184,13 @@ def extranet_loss(
     """ExtraNet's loss: `l1_loss` + hole_weight `hole_loss` + shade_weight `shading_loss`.
 
     Args:
-        prediction, target: `[H, W, C]`, in the log domain.
+        prediction: `[H, W, C]`, in the log domain.
+        target: the ground truth, of the same shape.
         mask: `[H, W, 1]`, 1 = valid, 0 = hole.
-        hole_weight, shade_weight: the paper's lambdas.
-        shade, fraction: as in `shading_loss`.
+        hole_weight: of `hole_loss`, the paper's lambda.
+        shade_weight: of `shading_loss`, likewise.
+        shade: as in `shading_loss`.
+        fraction: as in `shading_loss`.
 
     Returns:
         The total, and its parts without their weights: "l1", "hole", "shade".
@@ -225,7 +226,9 @@ def relative_loss(
     Its mean over frames is what decibels average: a tenth less is 0.46 dB, in easy frames as in hard ones.
 
     Args:
-        prediction, target, guess: `[H, W, C]`.
+        prediction: `[H, W, C]`.
+        target: the ground truth, of the same shape.
+        guess: what the network improves on, of the same shape.
         epsilon: mean squared error that is added to the guess's.
 
     Returns:
@@ -240,5 +243,5 @@ def relative_loss(
     difference, finite = _difference(prediction, target)
     before, _ = _difference(jax.lax.stop_gradient(guess), target)
     count = _count(finite, difference)
-    scale = _share(jnp.sum(jnp.square(before)), count) + jnp.asarray(epsilon, difference.dtype)
-    return _share(jnp.sum(jnp.square(difference)), count) / scale
+    scale = divide(jnp.sum(jnp.square(before)), count) + jnp.asarray(epsilon, difference.dtype)
+    return divide(jnp.sum(jnp.square(difference)), count) / scale

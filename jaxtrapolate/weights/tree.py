@@ -1,12 +1,13 @@
 """Weights as a tree of arrays and as arrays by name, "path/of/param"."""
 
-import dataclasses
 import hashlib
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
+
+from jaxtrapolate.files.tables import parse
 
 T = TypeVar("T")
 C = TypeVar("C")
@@ -91,15 +92,12 @@ def _listed(names: list[str]) -> str:
 
 
 def configured(kind: type[C], stated: Mapping[str, Any], *, source: str) -> C:
-    """A dataclass from what JSON says about it: lists become tuples, what is not said has its default.
+    """A dataclass from what a file of weights states about it (`tables.parse`); the rest has its default.
 
     Raises:
         ValueError: one line that names `source` and an entry that the configuration does not have or take.
     """
-    known = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    if unknown := [name for name in stated if name not in known]:
-        raise ValueError(f"{source}: {kind.__name__} has no {', '.join(unknown)}; a newer version may have")
     try:
-        return kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in stated.items()})
-    except (TypeError, ValueError) as error:
+        return parse(kind, stated)
+    except ValueError as error:
         raise ValueError(f"{source}: {kind.__name__}: {error}") from error
