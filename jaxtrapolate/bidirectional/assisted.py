@@ -184,7 +184,7 @@ def interpolate_assisted(
         alpha: in 0..1, traced.
         epsilon_depth: how far depths of one point may differ, relative to the smaller.
         filter: of the colours, as in `backward_warp`.
-        shade_on_miss: called with the mask `[H, W]` of the pixels visible in neither frame, gives their colour 
+        shade_on_miss: called with the mask `[H, W]` of the pixels visible in neither frame, gives their colour
             `[H, W, C']`.
         shade_attributes: called with the blended attributes, gives the colour `[H, W, C']`; it may close over what
             changes.

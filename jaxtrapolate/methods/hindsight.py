@@ -85,6 +85,8 @@ def _hindsight(state, values: Values):
 HINDSIGHT = Stage(
     "hindsight",
     _hindsight,
+    takes=("history", "motion"),
+    gives=("plain_share",),
     reads=("history.albedo", "target.albedo", "newest.motion", "before_newest.motion"),
     optional=True,
     past=2,
