@@ -148,10 +148,12 @@ class Shared(ExtraNetTask):
 
 def configuration(variant: Variant, steps: int, seed: int) -> Config:
     """The training run of a variant."""
-    rate = Optimizer(learning_rate=2e-3, warmup=100, constant=steps // 4, floor=0.02, clip=1.0)
+    rate = Optimizer(peak_learning_rate=2e-3, warmup=100, constant=steps // 4, floor=0.02, clip=1.0)
     often = {"log_every": min(100, steps), "checkpoint_every": steps, "validate_every": steps}
     rounds = {"batch": 8, "pool": 32, "steps_per_round": 100}
-    return Config("extranet", variant.options, steps=steps, seed=seed, optimizer=rate, average=0.998, **rounds, **often)
+    return Config(
+        "extranet", variant.options, steps=steps, seed=seed, optimizer=rate, ema_decay=0.998, **rounds, **often
+    )
 
 
 class Scorer:

@@ -147,7 +147,7 @@ depth = { file = "{frame:04d}.png", channels = ["R"], scale = 0.01, offset = 1e3
 sky = { file = "{frame:04d}.png", layer = "View.Depth", channels = "R", above = 1e9, srgb = false }
 motion = { file = "{frame:04d}.png", codes = true, valid = "B", channels = "RG" }
 """
-RUN = {"task": "extranet", "steps": 100, "optimizer": {"learning_rate": 0.001}, "options": {"crop": [64, 64]}}
+RUN = {"task": "extranet", "steps": 100, "optimizer": {"peak_learning_rate": 0.001}, "options": {"crop": [64, 64]}}
 
 
 def _toml(folder):
@@ -156,7 +156,7 @@ def _toml(folder):
         'task = "extranet"',
         "steps = 100",
         "[optimizer]",
-        "learning_rate = 1e-3",
+        "peak_learning_rate = 1e-3",
         "[options]",
         "crop = [64, 64]",
         "",

@@ -16,6 +16,7 @@ from hypothesis.extra.numpy import arrays
 from oracles import SIZES, inner_motion, random, random_motion
 
 import jaxtrapolate as jx
+from jaxtrapolate.ops import warp as warp_module
 from jaxtrapolate.ops.warp import root
 
 pytestmark = pytest.mark.usefixtures("strict")
@@ -346,7 +347,7 @@ def test_no_compilation_for_another_outside_number():
     for value in (0.0, 0.5, -3.0):
         run(image, motion, value)
     assert len(traces) == 1
-    inner = jx.gather._backward_warp
+    inner = warp_module._backward_warp
     jx.backward_warp(image, motion, outside=0.125)
     before = inner._cache_size()
     for value in (0.25, 7.0, -1.0):

@@ -10,6 +10,7 @@ import pytest
 from oracles import random, random_motion
 
 import jaxtrapolate as jx
+from jaxtrapolate.ops import guided
 from jaxtrapolate.ops.guided import guided_taps
 
 SIZE = (9, 11)
@@ -218,10 +219,10 @@ def test_gradients_stay_finite_where_guides_are_equal(sigma):
 def test_other_sigmas_compile_nothing():
     arrays = [jnp.asarray(a) for a in small()]
     jx.guided_warp(*arrays, **SMALL, sigma_guide=0.1, sigma_space=2.0)
-    before = jx.guided._guided_warp._cache_size()
+    before = guided._guided_warp._cache_size()
     for a, b in ((0.05, 1.0), (1e-20, 3.0), (7.0, 0.1)):
         jx.guided_warp(*arrays, **SMALL, sigma_guide=a, sigma_space=b)
-    assert jx.guided._guided_warp._cache_size() == before
+    assert guided._guided_warp._cache_size() == before
 
 
 @pytest.mark.parametrize(

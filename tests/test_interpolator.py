@@ -11,7 +11,7 @@ from oracles import random
 
 import jaxtrapolate as jx
 from jaxtrapolate.networks import Interpolator, InterpolatorConfig, inference
-from jaxtrapolate.networks.blocks import double, shuffle
+from jaxtrapolate.networks.blocks import pixel_shuffle, upsample_2x
 from jaxtrapolate.networks.interpolator import _warp
 
 SMALL = InterpolatorConfig(widths=(4, 6))
@@ -52,10 +52,10 @@ def test_double_and_shuffle_against_loops(size):
     x = random(1, *size, 8)
     height, width = size
     grown = np.stack([np.interp(np.arange(2 * height) / 2, np.arange(height), row) for row in x[0, :, 0].T], -1)
-    np.testing.assert_allclose(double(jnp.asarray(x), aligned=False)[0, :, 0], grown, atol=1e-6)
+    np.testing.assert_allclose(upsample_2x(jnp.asarray(x), aligned=False)[0, :, 0], grown, atol=1e-6)
     grown = np.stack([np.interp(np.arange(2 * width) / 2, np.arange(width), row) for row in x[0, 0].T], -1)
-    np.testing.assert_allclose(double(jnp.asarray(x), aligned=False)[0, 0], grown, atol=1e-6)
-    found = shuffle(jnp.asarray(x))
+    np.testing.assert_allclose(upsample_2x(jnp.asarray(x), aligned=False)[0, 0], grown, atol=1e-6)
+    found = pixel_shuffle(jnp.asarray(x))
     for r, c in np.ndindex(2 * height, 2 * width):
         quarter = 2 * (r % 2) + c % 2
         np.testing.assert_array_equal(found[0, r, c], x[0, r // 2, c // 2, 2 * quarter : 2 * quarter + 2])

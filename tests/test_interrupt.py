@@ -96,3 +96,22 @@ def test_the_program_ends_while_it_is_being_imported():
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=30)
     assert (process.returncode, err) == (130, MESSAGE)
+
+
+def test_threads_that_are_still_at_work_say_nothing():
+    """As those that write a checkpoint, which cannot go on once Python takes itself down."""
+    program = """
+import importlib, sys, threading
+from jaxtrapolate.commands import script
+def late():
+    threading.main_thread().join()
+    print("cannot go on", file=sys.stderr)
+def main():
+    threading.Thread(target=late).start()
+    print("jaxtrapolate: interrupted; run again to go on", file=sys.stderr)
+    return 130
+importlib.import_module("jaxtrapolate.commands.main").main = main
+sys.exit(script.script())
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (130, MESSAGE)

@@ -50,7 +50,7 @@ def test_no_arrow_leads_upward():
 
 def test_few_modules_at_the_root():
     at_the_root = {p.stem for p in PACKAGE.glob("*.py")} - {"__init__", "__main__", "_version"}
-    assert at_the_root == {"atomic", "checks", "errors", "precision", "records", "regular", "results", "tables"}
+    assert at_the_root == {"atomic", "checks", "errors", "precision", "records", "regular", "results"}
 
 
 def test_modules_are_short():

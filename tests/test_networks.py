@@ -11,7 +11,7 @@ from scipy.ndimage import zoom
 from scipy.signal import correlate2d
 
 from jaxtrapolate.networks import GATED_CONVOLUTION, ExtraNet, ExtraNetConfig, extranet_from_torch, fold, inference
-from jaxtrapolate.networks.blocks import HE, Layer, double, pad_to_multiple
+from jaxtrapolate.networks.blocks import HE, Layer, pad_to_multiple, upsample_2x
 from jaxtrapolate.weights import read_torch
 
 PAPER = ExtraNetConfig()
@@ -228,17 +228,17 @@ def test_prelu():
 @pytest.mark.parametrize("size", [(5, 7), (2, 3)])
 def test_double_against_scipy(size):
     x = random(2, *size, 3)
-    np.testing.assert_allclose(double(jnp.asarray(x)), zoom(np.float64(x), (1, 2, 2, 1), order=1), atol=1e-6)
+    np.testing.assert_allclose(upsample_2x(jnp.asarray(x)), zoom(np.float64(x), (1, 2, 2, 1), order=1), atol=1e-6)
 
 
 def test_double_of_single_rows_and_columns_repeats_them():
     x = random(1, 1, 4, 2)
-    wide = double(jnp.asarray(x))
+    wide = upsample_2x(jnp.asarray(x))
     np.testing.assert_array_equal(wide[:, 0], wide[:, 1])
     np.testing.assert_allclose(wide[0, 0], zoom(np.float64(x[0, 0]), (2, 1), order=1), atol=1e-6)
-    tall = double(jnp.asarray(x.swapaxes(1, 2)))
+    tall = upsample_2x(jnp.asarray(x.swapaxes(1, 2)))
     np.testing.assert_array_equal(tall, wide.swapaxes(1, 2))
-    np.testing.assert_array_equal(double(jnp.asarray(x[:, :, :1])), np.broadcast_to(x[:, :, :1], (1, 2, 2, 2)))
+    np.testing.assert_array_equal(upsample_2x(jnp.asarray(x[:, :, :1])), np.broadcast_to(x[:, :, :1], (1, 2, 2, 2)))
 
 
 @pytest.mark.parametrize("size", [(5, 7), (1, 1), (8, 16), (9, 3)])

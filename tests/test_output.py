@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from synthetic import SyntheticSequence
@@ -70,7 +71,7 @@ def test_the_code_has_a_hash_that_knows_every_module(tmp_path, monkeypatch):
     module.code.cache_clear()
     before = module.code()
     copy = tmp_path / "jaxtrapolate"
-    shutil.copytree(os.path.dirname(module.__file__), copy, ignore=shutil.ignore_patterns("*.npz", "__pycache__"))
+    shutil.copytree(Path(module.__file__).parents[1], copy, ignore=shutil.ignore_patterns("*.npz", "__pycache__"))
     monkeypatch.setattr(module.resources, "files", lambda name: copy)
     module.code.cache_clear()
     assert module.code() == before

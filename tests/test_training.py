@@ -47,7 +47,7 @@ def config(options=None, **fields):
         "log_every": 2,
         "checkpoint_every": 6,
         "validate_every": 12,
-        "optimizer": Optimizer(learning_rate=0.03),
+        "optimizer": Optimizer(peak_learning_rate=0.03),
     }
     return Config(task="toy", options=options or ToyOptions(), **{**defaults, **fields})
 
@@ -73,7 +73,7 @@ def same_models(first, second):
 def whole(tmp_path_factory):
     """A run without interruption, with every kind of state: batch norm, a count, averages."""
     workdir = tmp_path_factory.mktemp("whole")
-    settings = config(ToyOptions(wobble=0.1), average=0.9)
+    settings = config(ToyOptions(wobble=0.1), ema_decay=0.9)
     return settings, workdir, train_and_evaluate(settings, workdir)
 
 
@@ -101,7 +101,7 @@ def test_what_a_run_writes(whole):
 
 def test_the_first_step_is_adams(tmp_path):
     """Against a float64 loop: least squares on the pixels that the batch holds, then Kingma and Ba's algorithm 1."""
-    settings, task = config(ToyOptions(norm=False), optimizer=Optimizer(learning_rate=0.1, constant=9)), ToyTask()
+    settings, task = config(ToyOptions(norm=False), optimizer=Optimizer(peak_learning_rate=0.1, constant=9)), ToyTask()
     task.options = settings.options
     step, pool = make_step(task, settings), task.pool(round_key(0, 0), range(16))
     state = step.create()
@@ -156,7 +156,7 @@ def test_the_answer_is_found(tmp_path):
 @pytest.mark.parametrize("clip", [None, 0.5])
 def test_clipping(clip):
     """With a huge epsilon Adam's first step is the learning rate times the gradient over epsilon."""
-    optimizer = transformation(Optimizer(learning_rate=1.0, constant=9, epsilon=1e4, clip=clip), 10)
+    optimizer = transformation(Optimizer(peak_learning_rate=1.0, constant=9, epsilon=1e4, clip=clip), 10)
     gradient = {"a": jnp.array([3.0, 0.0]), "b": jnp.array([4.0])}
     updates, _ = optimizer.update(gradient, optimizer.init(gradient), gradient)
     factor = 1.0 if clip is None else clip / 5
@@ -166,7 +166,7 @@ def test_clipping(clip):
 
 def test_learning_rate():
     """Against its formula in float64; the run may stop before the cosine ends."""
-    optimizer = Optimizer(learning_rate=2e-3, warmup=10, constant=20, decay=100, floor=0.1)
+    optimizer = Optimizer(peak_learning_rate=2e-3, warmup=10, constant=20, decay=100, floor=0.1)
     rate = schedule(optimizer, 80)
     for step in (0, 3, 9, 10, 15, 29, 30, 31, 55, 79, 130, 200):
         fall = min(max(step - 30, 0), 100) / 100
@@ -177,7 +177,7 @@ def test_learning_rate():
 
 def test_averages(tmp_path):
     """The exported weights against the recursion in float64 over every step's checkpoint."""
-    settings = config(steps=6, log_every=1, checkpoint_every=1, validate_every=6, keep=6, average=0.35)
+    settings = config(steps=6, log_every=1, checkpoint_every=1, validate_every=6, keep=6, ema_decay=0.35)
     train_and_evaluate(settings, tmp_path)
     step = make_step(ToyTask(), settings)
     state = step.create()
@@ -233,8 +233,8 @@ def test_a_run_begins_with_given_weights(whole, tmp_path):
             begun.append(model_arrays(model))
             return super().validate(model)
 
-    settings = config(steps=2, average=0.5, log_every=1, checkpoint_every=1, validate_every=1)
-    settings = dataclasses.replace(settings, optimizer=Optimizer(learning_rate=1e-12))
+    settings = config(steps=2, ema_decay=0.5, log_every=1, checkpoint_every=1, validate_every=1)
+    settings = dataclasses.replace(settings, optimizer=Optimizer(peak_learning_rate=1e-12))
     for number, start in enumerate((workdir / "model", file)):
         run = dataclasses.replace(settings, start=str(start))
         train_and_evaluate(run, tmp_path / str(number), task=Watched())
@@ -369,7 +369,7 @@ def test_score_that_validation_does_not_give(tmp_path):
 
 def test_another_configuration_is_refused(whole):
     _, workdir, _ = whole
-    changed = config(ToyOptions(wobble=0.2), average=0.9, optimizer=Optimizer(learning_rate=0.03, clip=1.0))
+    changed = config(ToyOptions(wobble=0.2), ema_decay=0.9, optimizer=Optimizer(peak_learning_rate=0.03, clip=1.0))
     with pytest.raises(InputError) as error:
         train_and_evaluate(changed, workdir)
     assert "options.wobble was 0.1, is now 0.2; optimizer.clip was null, is now 1.0; choose" in str(error.value)
@@ -424,8 +424,8 @@ TABLE = {
     "log_every": 2,
     "checkpoint_every": 6,
     "validate_every": 12,
-    "average": 0.9,
-    "optimizer": {"learning_rate": 0.03},
+    "ema_decay": 0.9,
+    "optimizer": {"peak_learning_rate": 0.03},
     "options": {"wobble": 0.1},
 }
 
@@ -508,7 +508,7 @@ def test_two_processes_give_what_one_gives(tmp_path):
     table = {**TABLE, "options": {}}
     lines = [f"{k} = {json.dumps(v)}" for k, v in table.items() if not isinstance(v, dict)]
     file = tmp_path / "run.toml"
-    file.write_text("\n".join([*lines, "[optimizer]", "learning_rate = 0.03", ""]))
+    file.write_text("\n".join([*lines, "[optimizer]", "peak_learning_rate = 0.03", ""]))
     processes = [
         run_python(
             COMMAND.format(tests=str(TESTS), file=str(file), port=port, number=i),
@@ -564,7 +564,7 @@ toy_task.ToyTask.pool = pool
 
 def test_weight_decay_is_decoupled():
     """Against Loshchilov and Hutter's algorithm 2 in float64: two steps on fixed gradients."""
-    optimizer = transformation(Optimizer(learning_rate=0.1, constant=9, weight_decay=0.2), 10)
+    optimizer = transformation(Optimizer(peak_learning_rate=0.1, constant=9, weight_decay=0.2), 10)
     weight, state = jnp.array([1.0, -2.0]), optimizer.init(jnp.zeros(2))
     expected, m, v = np.array([1.0, -2.0]), 0.0, 0.0
     for t, gradient in enumerate(([0.5, -0.1], [-0.2, 0.4]), 1):

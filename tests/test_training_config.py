@@ -8,14 +8,14 @@ from jaxtrapolate.errors import InputError
 from jaxtrapolate.training import Optimizer, config_names, load_config, parse_config
 from jaxtrapolate.weights import load_orbax
 
-GOOD = {"task": "toy", "steps": 10, "optimizer": {"learning_rate": 1, "warmup": 3}, "options": {"crop": [4, 5]}}
+GOOD = {"task": "toy", "steps": 10, "optimizer": {"peak_learning_rate": 1, "warmup": 3}, "options": {"crop": [4, 5]}}
 
 
 def test_configuration_from_a_table():
     made = parse_config(GOOD)
     assert made.options == ToyOptions(crop=(4, 5))
-    assert made.optimizer == Optimizer(learning_rate=1.0, warmup=3)
-    assert type(made.optimizer.learning_rate) is float
+    assert made.optimizer == Optimizer(peak_learning_rate=1.0, warmup=3)
+    assert type(made.optimizer.peak_learning_rate) is float
     assert made.pool % made.batch == 0
 
 
@@ -39,11 +39,14 @@ def test_a_byte_order_mark(tmp_path):
         ({"precision": "float16"}, "precision: expected one of 'float32', 'bfloat16', got 'float16'"),
         ({"batch": 3}, "pool: expected a multiple of batch = 3, got 64"),
         ({"log_every": 7}, "checkpoint_every: expected a multiple of log_every = 7, got 500"),
-        ({"average": 1.0}, "average: expected at least 0 and below 1, got 1.0"),
+        ({"ema_decay": 1.0}, "ema_decay: expected at least 0 and below 1, got 1.0"),
         ({"optimizer": 5}, "optimizer: expected a table, got 5"),
-        ({"optimizer": {"lr": 1}}, "optimizer.lr: no such setting; there are learning_rate, .*"),
-        ({"optimizer": {"learning_rate": "1"}}, "optimizer.learning_rate: expected a number, got '1'"),
-        ({"optimizer": {"learning_rate": float("nan")}}, "optimizer.learning_rate: expected above 0, got nan"),
+        ({"optimizer": {"lr": 1}}, "optimizer.lr: no such setting; there are peak_learning_rate, .*"),
+        ({"optimizer": {"peak_learning_rate": "1"}}, "optimizer.peak_learning_rate: expected a number, got '1'"),
+        (
+            {"optimizer": {"peak_learning_rate": float("nan")}},
+            "optimizer.peak_learning_rate: expected above 0, got nan",
+        ),
         ({"optimizer": {"floor": 2}}, "optimizer.floor: expected at least 0 and at most 1, got 2.0"),
         ({"options": []}, r"options: expected a table, got \[\]"),
         ({"options": {"crop": [1]}}, r"options.crop: expected an array of 2, got \[1\]"),

@@ -228,7 +228,7 @@ def test_a_short_run_learns_and_its_weights_load(tmp_path):
         network=SMALL, windows=windows, crop=(32, 48), validation=2, preparation=Preparation(first_guess="guided")
     )
     config = Config("extranet", options, steps=120, batch=4, pool=8, steps_per_round=60, log_every=20,
-                    checkpoint_every=120, validate_every=120, optimizer=Optimizer(learning_rate=3e-3))  # fmt: skip
+                    checkpoint_every=120, validate_every=120, optimizer=Optimizer(peak_learning_rate=3e-3))  # fmt: skip
     scores = train_and_evaluate(config, tmp_path)
     assert set(scores) >= {"gain", "psnr", "psnr_hole", "guess", "composite"}
     lines = [line for line in (tmp_path / "metrics.jsonl").read_text().splitlines() if '"train"' in line]

@@ -120,7 +120,7 @@ def test_a_short_run_learns_and_becomes_a_file(capsys, tmp_path):
     windows = WindowOptions(size=(48, 64), scenes=("walkers",), motion="direct", step=(0.2, 0.4))
     options = dataclasses.replace(OPTIONS, windows=windows, crop=(32, 48))
     config = Config("interpolator", options, steps=120, batch=4, pool=8, steps_per_round=60, log_every=20,
-                    checkpoint_every=120, validate_every=120, optimizer=Optimizer(learning_rate=2e-3))  # fmt: skip
+                    checkpoint_every=120, validate_every=120, optimizer=Optimizer(peak_learning_rate=2e-3))  # fmt: skip
     scores = train_and_evaluate(config, tmp_path / "run")
     assert set(scores) >= {"psnr", "blend"}
     assert np.isfinite(list(scores.values())).all()

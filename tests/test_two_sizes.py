@@ -1,5 +1,6 @@
 """Frames of two sizes, jittered ones, and cuts: what methods that super sample are handed and compared with."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -122,6 +123,29 @@ def test_a_jittered_frame_is_fetched_where_its_samples_are():
         jx.backward_warp(frames[0].color, jnp.full((24, 32, 2), jnp.float32([-3, 0])), filter="bicubic")
     )
     assert np.abs(unaware - frame(2).color)[4:-4, 6:-4].max() > 0.05
+
+
+@pytest.mark.parametrize("name", ["warp", "guided_warp", "bidirectional", "blend"])
+def test_methods_fetch_jittered_frames_where_their_samples_are(name):
+    """A picture that stands still, sampled elsewhere each frame: what is generated lies on the target's pixels."""
+    y, x = np.mgrid[0:24, 0:32].astype(np.float64)
+
+    def frame(k, *, jitter):
+        ones, still = np.ones((24, 32, 1), np.float32), np.zeros((24, 32, 2), np.float32)
+        buffers = jx.GBuffer(albedo=np.full((24, 32, 3), 0.5, np.float32), depth=5 * ones, stencil=0 * ones)
+        color = 1 + 0.5 * waves(x + jitter[0], y + jitter[1])
+        return jx.Frame(
+            color=color.astype(np.float32), gbuffer=buffers, motion=still, jitter=np.float32(jitter), time=float(k)
+        )
+
+    frames = [frame(0, jitter=(0.3, 0.2)), frame(1, jitter=(-0.4, 0.1)), frame(2, jitter=(0.25, -0.3))]
+    target = jx.replace(frames[1], color=None)
+    given = [*map(lambda f: jax.tree.map(jnp.asarray, f), (frames[0], target, frames[2]))]
+    method = jx.load(name)
+    future = (given[2],) if method.future else ()
+    image = np.asarray(method((given[0],), given[1], future))
+    error = np.abs(image - frames[1].color)[4:-4, 4:-4].max()
+    assert (error < 0.02) == (name != "blend"), error  # blend fetches nothing: it mixes pixel by pixel
 
 
 def test_a_jittered_camera_projects_to_pixels():

@@ -1,7 +1,7 @@
 """Scene-assisted interpolation (Yang et al. 2011, section 4), and what it shares with the image-based one.
 
-The geometry of the frame to be made is drawn without shading: its depth, and where its points are in the two rendered
-frames around it. Colours come from there, where a depth test finds the point visible.
+The geometry of the frame to be generated is drawn without shading: its depth, and where its points are in the two
+rendered frames around it. Colours come from there, where a depth test finds the point visible.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from jaxtrapolate.records import Keyframe, record, replace
 Shader = Callable[[Array], Array]
 
 CASES = ("agree", "nearer", "one", "neither", "assisted", "missed", "rendered")
-"""How a pixel was made; `Interpolation.case` gives indices into this.
+"""How a pixel was generated; `Interpolation.case` gives indices into this.
 
 Image-based (5.2): both searches hit the same point; both hit, and the nearer point was taken; one hit; neither did.
 Scene-assisted (4): the point is visible in at least one of the frames around; in neither. "rendered": drawn anew (6).
@@ -54,9 +54,9 @@ class Interpolation:
     """An interpolated frame and how it came about.
 
     color `[H, W, C]`. weight `[H, W, 1]`: that of the next frame's colour: alpha where both are blended, 0 or 1 where
-    one was taken alone. case `[H, W]`: index into `CASES`. forward, backward: the point's place in the frame before and
-    after, as searched or as given by the scene. depth `[H, W, 1]`: in the frame made; `None` without depth. offsets:
-    for the next frame's searches.
+    one was taken alone. case `[H, W]`: index into `CASES`. forward, backward: the point's position in the frame before
+    and after, as searched or as given by the scene. depth `[H, W, 1]`: in the interpolated frame; `None` without depth.
+    offsets: for the next frame's searches.
     """
 
     color: Float[Array, "h w c"]
@@ -219,13 +219,13 @@ def interpolate_assisted(
     check_choice("filter", filter, get_args(Filter))
     previous, next = (Keyframe(color=f.color, depth=f.depth) for f in (previous, next))
     target = replace(target, color=None, stencil=None, time=None)
-    made = _assisted(previous, next, target, alpha, epsilon_depth, filter=filter)
+    result = _assisted(previous, next, target, alpha, epsilon_depth, filter=filter)
     # not compiled with the rest: what they close over may change from frame to frame
-    color = made.color if shade_attributes is None else shade_attributes(made.color)
+    color = result.color if shade_attributes is None else shade_attributes(result.color)
     if shade_on_miss is not None:
-        missed = made.case == CASES.index("missed")
+        missed = result.case == CASES.index("missed")
         color = jnp.where(missed[..., None], shade_on_miss(missed).astype(color.dtype), color)
-    return replace(made, color=color)
+    return replace(result, color=color)
 
 
 def drawn_over(below: Interpolation, above: Interpolation, covered: Array, epsilon: Array) -> Interpolation:
@@ -258,7 +258,7 @@ def overlay(
     """Pixels that were rendered anew, drawn over an interpolated frame through one depth buffer (Figure 4).
 
     Args:
-        below: the interpolated frame, as a rule made of I-frames that leave out what is drawn now.
+        below: the interpolated frame, as a rule from I-frames that leave out what is drawn now.
         color: `[H, W, C]`.
         depth: `[H, W, 1]`.
         covered: `[H, W]`, where something was rendered.

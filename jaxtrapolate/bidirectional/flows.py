@@ -157,7 +157,7 @@ def _deepened(flow, depth, other_depth):
 
 @partial(jax.jit, static_argnames=("depth",))
 def complete_flows(previous: Keyframe, next: Keyframe, *, depth: DepthKind = "metric") -> CompletedFlows:
-    """Two keyframes with both flows between them, those that the input lacks made from the other.
+    """Two keyframes with both flows between them, those that the input lacks derived from the other.
 
     A missing flow is the other one turned around: -flow, splatted along it (`splat_nearest`, depth-tested where there
     is depth). Where nothing lands (points that are hidden or outside in the other frame), or, with metric depth, where
@@ -173,7 +173,7 @@ def complete_flows(previous: Keyframe, next: Keyframe, *, depth: DepthKind = "me
         depth: "metric" (distance along the view axis), or "ordinal" (only its order counts).
 
     Returns:
-        `CompletedFlows`. What was given is kept as it is, but nothing has depth +inf. Flow vectors of a splat are of
+        `CompletedFlows`. What was given is kept unchanged, but nothing has depth +inf. Flow vectors of a splat are of
         the dtype of the given flow.
 
     Convention:

@@ -35,11 +35,11 @@ from jaxtrapolate.bidirectional.search import (
     check_flow,
     check_scalar,
     fetch_finite,
+    flow_and_residual,
     leads,
-    missed,
-    missed_by,
     plane,
     positions,
+    residual,
     solve,
     within,
 )
@@ -61,7 +61,7 @@ _EQUAL = 1e-3  # pixels: errors that differ by less do so by rounding
 
 
 class _Found(NamedTuple):
-    """One solution of a search `[rows, W, ...]`: place, whole flow, error, depth in the frame to be made, hit."""
+    """One solution of a search `[rows, W, ...]`: position, whole flow, residual, depth at t + alpha, hit."""
 
     at: Array
     flow: Array
@@ -82,9 +82,9 @@ class _Options(NamedTuple):
 class _Side(NamedTuple):
     """What there is of one I-frame, all rows.
 
-    depth: `held`, so that nothing is at 1e30. passed: the depth `[H, W]` of its points in the frame to be made. leads:
-    of its flow toward the other I-frame. finite: whether the colours and the depths are. latest: what the frame made
-    last leaves.
+    depth: `held`, so that nothing is at 1e30. passed: the depth `[H, W]` of its points in the frame to be generated.
+    leads: of its flow toward the other I-frame. finite: whether the colours and the depths are. latest: what the frame
+    interpolated last leaves.
     """
 
     color: Array
@@ -138,7 +138,7 @@ def _best(sources, top, rows: int, *, options: _Options) -> Array:
 
     def step(best, given):
         at = found(given[1])
-        error = missed(side.leads, at, top, options.search.filter)
+        error = residual(side.leads, at, top, options.search.filter)
         depth = jnp.zeros_like(error)
         if side.passed is not None and options.search.choice == "depth":
             depth = sample(side.passed[..., None], at.real, at.imag, filter=options.search.filter)[..., 0]
@@ -154,7 +154,7 @@ def _best(sources, top, rows: int, *, options: _Options) -> Array:
     grid = plane(positions(rows, side.size[1], side.flow.dtype, top=top))
     starts = jnp.stack([grid if start is None else start for start in starts])
     none = jnp.zeros(grid.shape, side.flow.dtype)
-    # a loop, because XLA on a CPU would make every solution anew for each that is compared with it
+    # a loop is a fusion boundary: without it XLA on a CPU recomputes every solution in each comparison
     return jax.lax.scan(step, (grid, none, none), (jnp.arange(len(starts)) == 0, starts))[0][0]
 
 
@@ -164,7 +164,7 @@ def _find(side: _Side, other: _Side, epsilon, top, rows: int, options: _Options)
     best = partial(_best, options=options)
     at = by_strips(best, rows, sources) if rows == side.size[0] else best(sources, top, rows)
     at, value = solve(side.leads, at, top, rows, 0, options.search.solver, options.search.filter)
-    value, error = missed_by(at, value, side.fraction, positions(rows, side.size[1], side.flow.dtype, top=top))
+    value, error = flow_and_residual(at, value, side.fraction, positions(rows, side.size[1], side.flow.dtype, top=top))
     hit = (error < epsilon) & within(at, *side.size)[..., None]
     depth = jnp.zeros_like(error)
     if side.depth is not None:
@@ -176,7 +176,7 @@ def _find(side: _Side, other: _Side, epsilon, top, rows: int, options: _Options)
 
 
 def _visible_in(other: _Side, found: _Found, epsilon_depth, epsilon_trip, options: _Options):
-    """Whether a point found in one I-frame is seen in the other (5.2): its place there, and the answer `[H, W, 1]`."""
+    """A point found in one I-frame, in the other (5.2): its position, and whether it is visible there `[H, W, 1]`."""
     there = found.at + found.flow[..., :2]
     seen = within(there, *other.size)[..., None] & (found.error < jnp.inf)
     if options.visibility == "depth":
@@ -260,8 +260,8 @@ def _interpolate(previous, next, alpha, offsets, search, visibility, *, filter, 
         last = offsets.alpha.astype(wide)
         lasts = (offsets.forward, offsets.forward_depth, last), (offsets.backward, offsets.backward_depth, 1 - last)
     sources = side(previous, flow, alpha, *lasts[0]), side(next, opposite, 1 - alpha, *lasts[1]), *epsilons
-    made, left = by_strips(partial(_part, options=options), flow.shape[0], sources)
-    return replace(made, offsets=Offsets(alpha, *left))
+    result, left = by_strips(partial(_part, options=options), flow.shape[0], sources)
+    return replace(result, offsets=Offsets(alpha, *left))
 
 
 def _checked(previous: Keyframe, next: Keyframe) -> Size:
@@ -357,6 +357,6 @@ def interpolate_image_based(
     _checked(previous, next)
     depth, test = _resolve(previous, next, visibility)
     how = {"filter": filter, "depth": depth, "test": test}
-    made = _interpolate(*slim(previous, next), alpha, offsets, search, visibility, **how)
+    result = _interpolate(*slim(previous, next), alpha, offsets, search, visibility, **how)
     # not compiled with the rest: what it closes over may change from frame to frame
-    return made if shade_attributes is None else replace(made, color=shade_attributes(made.color))
+    return result if shade_attributes is None else replace(result, color=shade_attributes(result.color))

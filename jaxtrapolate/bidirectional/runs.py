@@ -1,6 +1,6 @@
-"""Many frames around rendered ones, made one after the other: an interval's, or those of an open shutter.
+"""Many frames around rendered ones, generated one after the other: an interval's, or those of an open shutter.
 
-Each starts its searches where those of the frame made before it ended (Yang et al. 2011, section 5.3).
+Each starts its searches where those of the frame interpolated before it ended (Yang et al. 2011, section 5.3).
 """
 
 from collections.abc import Callable, Sequence
@@ -48,22 +48,22 @@ def _frames(previous, next, alphas, targets, lights, keep: Callable, total, trac
         offsets, total = carried
         alpha, target, light = given
         how = traced | dict(options) | {"shade_attributes": _lit(options, light)}
-        made = interpolate_bidirectional(previous, next, alpha, target=target, offsets=offsets, **how)
-        total, kept = keep(total, made.color)
-        return (offsets if made.offsets is None else made.offsets, total), kept
+        result = interpolate_bidirectional(previous, next, alpha, target=target, offsets=offsets, **how)
+        total, kept = keep(total, result.color)
+        return (offsets if result.offsets is None else result.offsets, total), kept
 
     none = jnp.zeros((*previous.color.shape[:2], 2), alphas.dtype)
     known = previous.depth is not None and next.depth is not None
     far = jnp.full((*none.shape[:2], 1), jnp.inf, none.dtype) if known else None
     start = Offsets(jnp.asarray(0.5, none.dtype), none, none, far, far)  # of no frame yet
-    # differentiated, a step is made again, instead of keeping all that it computed
+    # differentiated, a step is recomputed, instead of keeping all its intermediate values
     step = jax.checkpoint(step, prevent_cse=False)
     (_, total), kept = jax.lax.scan(step, (start, total), (alphas, targets, lights))
     return total, kept
 
 
 def _wide(*frames: Keyframe):
-    """The dtype of places between some frames."""
+    """The dtype of positions between some frames."""
     flows = [flow for frame in frames for flow in (frame.forward_flow, frame.backward_flow) if flow is not None]
     return widest(*flows)
 
@@ -156,28 +156,28 @@ def motion_blur(
     lights: Any = None,
     **options: Any,
 ) -> Float[Array, "h w c"]:
-    """A rendered frame as a camera with an open shutter sees it: the mean of it and of the frames made around it.
+    """A rendered frame as a camera with an open shutter sees it: the mean of it and of frames interpolated around it.
 
     The time that the shutter is open, half of it before and half after the rendered frame, is divided into
-    2 samples + 1 equal parts. The middle of the middle part is the rendered frame; those of the others are made, from
-    it and the frame before, or it and the frame after.
+    2 samples + 1 equal parts. The middle of the middle part is the rendered frame; those of the others are generated,
+    from it and the frame before, or it and the frame after.
 
     Args:
         previous: color `[H, W, C]`, forward_flow, depth (may be absent).
         current: color, both flows, depth.
         next: color, backward_flow, depth. The flows lead from each to the next of the three.
         shutter: in intervals between rendered frames, 0..2; 1/2 is a shutter of 180 degrees at their rate. Traced.
-        samples: frames that are made on each side, at least 1; they are made one after the other, so that memory does
-            not depend on it.
-        targets: the geometry of the frames to be made, `target` of `interpolate_bidirectional`, each field
-            `[2 samples, ...]` in order of time: at k shutter / (2 samples + 1) intervals from `current`, k = -samples .. samples
-            without 0.
+        samples: frames that are generated on each side, at least 1; they are generated one after the other, so that
+            memory does not depend on it.
+        targets: the geometry of the frames to be generated, `target` of `interpolate_bidirectional`, each field
+            `[2 samples, ...]` in order of time: at k shutter / (2 samples + 1) intervals from `current`, k = -samples
+            .. samples without 0.
         lights: as of `interpolate_run`, `[2 samples + 1, ...]` in order of time, with the rendered frame's.
         options: of `interpolate_bidirectional`, but target and offsets. `shade_attributes` is called for each frame,
             the rendered one too, and what it gives is averaged.
 
     Returns:
-        `[H, W, C]`. Colours are averaged as they are: they should be linear radiance, before any tone mapping.
+        `[H, W, C]`. Colours are averaged unchanged: they should be linear radiance, before any tone mapping.
 
     Convention:
         Each flow belongs to its own frame's grid and is added; pixels, x right, y down, integers are centres.
@@ -190,8 +190,8 @@ def motion_blur(
         As of `interpolate_bidirectional`. A colour that is not finite in one of the frames is not finite in the mean.
 
     Gradient:
-        With respect to colours, flows and shutter, as of `interpolate_bidirectional`; of each frame made its offsets
-        are kept for the reverse pass, and the rest is made again.
+        With respect to colours, flows and shutter, as of `interpolate_bidirectional`; of each generated frame its
+        offsets are kept for the reverse pass, and the rest is recomputed.
 
     Raises:
         TypeError, ValueError: as of `interpolate_bidirectional`; samples below 1, or target or offsets given.

@@ -1,7 +1,7 @@
-"""Iterative search: where the points of a frame to be made lie in a rendered one (Yang et al. 2011, 5.1 and 5.3).
+"""Iterative search: where the points of a frame to be generated lie in a rendered one (Yang et al. 2011, 5.1 and 5.3).
 
 The flow of a rendered frame tells of its own points: the one at q will be at q + fraction * flow(q). For each pixel p
-of the frame to be made the search turns this around, q + fraction * flow(q) = p, by a few fetches from the flow.
+of the frame to be generated the search turns this around, q + fraction * flow(q) = p, by a few fetches from the flow.
 
 Convention:
     As in `jaxtrapolate.ops.warp`: pixels, x right, y down, integers are centres; a flow is a displacement to add,
@@ -33,10 +33,10 @@ _STEEPEST = 1e4  # pixels per pixel
 @record
 @dataclasses.dataclass(frozen=True)
 class Correspondence:
-    """What a search found for each pixel of the frame to be made.
+    """What a search found for each pixel of the frame to be generated.
 
     position `[H, W, 2]`: x and y in the rendered frame, in pixels; may lie outside of it. depth_offset `[H, W, 1]`:
-    what to add to that frame's depth there for the depth in the frame to be made; `None` for a flow without depth.
+    what to add to that frame's depth there for the depth in the frame to be generated; `None` for a flow without depth.
     error `[H, W, 1]`: how far, in pixels, the point there misses the pixel (eq. 7); infinite where the flow is not
     finite.
     """
@@ -106,7 +106,7 @@ def _finite(flow):
 
 
 def plane(pair: Array) -> Array:
-    """Two components `[..., 2]` as complex numbers: on a CPU one load serves both, and one loop makes both."""
+    """Two components `[..., 2]` as complex numbers: on a CPU one load serves both, and one loop computes both."""
     return jax.lax.complex(pair[..., 0], pair[..., 1])
 
 
@@ -179,7 +179,7 @@ def advance(leads: Leads, start: Array | None, top, rows: int, iterations: int, 
     return jax.lax.stop_gradient(jax.lax.scan(step, at, None, length=iterations)[0])
 
 
-def missed(leads: Leads, at: Array, top, filter: FlowFilter) -> Array:
+def residual(leads: Leads, at: Array, top, filter: FlowFilter) -> Array:
     """The error `[rows, W]` (eq. 7) of complex positions; infinite where the flow is not finite; no gradient."""
     pixels = plane(positions(at.shape[0], at.shape[1], leads.flow.dtype, top=top))
     apart = at + _looked(leads.passing, at, filter, product=_weighed) - pixels
@@ -217,7 +217,7 @@ def _solve_jvp(rows, iterations, solver, filter, primals, tangents):
     return (at, value), (d_at, moved + by_x * d_at[..., :1] + by_y * d_at[..., 1:])
 
 
-def missed_by(at, value, fraction, pixels) -> tuple[Array, Array]:
+def flow_and_residual(at, value, fraction, pixels) -> tuple[Array, Array]:
     """The whole flow at the positions found, 0 where it is not finite; and the error (eq. 7)."""
     known = jnp.where(jnp.isfinite(value), value, 0)
     x, y = (at[..., k] + fraction * known[..., k] - pixels[..., k] for k in (0, 1))
@@ -230,7 +230,7 @@ def missed_by(at, value, fraction, pixels) -> tuple[Array, Array]:
 def _search_part(sources, top, rows, *, iterations, solver, filter):
     at, value = _solve_part(sources, top, rows, iterations=iterations, solver=solver, filter=filter)
     flow, fraction = sources[0].flow, sources[0].fraction
-    known, error = missed_by(at, value, fraction, positions(rows, flow.shape[1], flow.dtype, top=top))
+    known, error = flow_and_residual(at, value, fraction, positions(rows, flow.shape[1], flow.dtype, top=top))
     return at, fraction * known[..., 2:], error
 
 
@@ -277,7 +277,7 @@ def iterative_search(
     solver: Solver = "fixed_point",
     filter: FlowFilter = "bilinear",
 ) -> Correspondence:
-    """For each pixel p the place q in a rendered frame whose point comes to p: q + fraction * flow(q) = p.
+    """For each pixel p the position q in a rendered frame whose point comes to p: q + fraction * flow(q) = p.
 
     "fixed_point": q <- p - fraction * flow(q) (eq. 5); converges where the flow changes by less than 1 / fraction
     pixels per pixel. "newton": q <- q - (I + fraction J)^-1 (q + fraction * flow(q) - p), J the derivative of the
@@ -285,8 +285,8 @@ def iterative_search(
 
     Args:
         flow: `[H, W, 3]` of the rendered frame, x and y in pixels, then the change of depth; or `[H, W, 2]`.
-        fraction: of the flow that passes until the frame to be made: alpha for the forward flow of the frame before it,
-            1 - alpha for the backward flow of the frame after it. Traced.
+        fraction: of the flow that passes until the frame to be generated: alpha for the forward flow of the frame
+            before it, 1 - alpha for the backward flow of the frame after it. Traced.
         start: `[H, W, 2]`, positions to start from; each pixel itself by default (eq. 4 and 8).
         iterations: steps; each fetches the flow once, and one fetch more gives depth_offset and error.
         solver: as above.

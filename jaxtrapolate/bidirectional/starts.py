@@ -1,4 +1,4 @@
-"""Where searches start (Yang et al. 2011, section 5.3): by the other I-frame's flow, by the frame made last."""
+"""Where searches start (Yang et al. 2011, section 5.3): by the other I-frame's flow, by the frame interpolated last."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -62,7 +62,7 @@ def _nearest_of(depth, planes, reach, axis):
 
 
 class LatestOffsets(NamedTuple):
-    """The offsets `[H, W, 2]` of the frame made last, at least float32, the depths of its points, the ratio to take."""
+    """Of the frame interpolated last: offsets `[H, W, 2]` (at least float32), its points' depths; the ratio to take."""
 
     offset: Array
     depth: Any
@@ -81,7 +81,7 @@ def latest(sources: LatestOffsets, top, rows: int, *, reach: int):
         beyond = (number < 0) | (number >= offset.shape[0])
         far = jnp.where(jnp.isnan(far) | beyond[:, None], jnp.inf, far)
         far = jnp.pad(far, [(0, 0), (reach, reach)], constant_values=jnp.inf)
-        # components apart, which XLA on a CPU makes by vectors
+        # components apart, which XLA vectorises on a CPU
         parts = [jnp.pad(around[..., k], [(0, 0), (reach, reach)]) for k in (0, 1)]
         for axis in (1, 0):
             far, parts = _nearest_of(far, parts, reach, axis)
@@ -96,10 +96,10 @@ def latest_start(
     depth: Float[ArrayLike, "h w 1"] | None = None,
     reach: int = 1,
 ) -> Float[Array, "h w 2"]:
-    """Where to start a search from by the frame made last: p - ratio * offset, that of the nearest surface around.
+    """Where to start a search from by the last interpolated frame: p - ratio * offset of the nearest surface around.
 
     Args:
-        offset: `[H, W, 2]`, p - position of the search in the same I-frame for the frame made last.
+        offset: `[H, W, 2]`, p - position of the search in the same I-frame for the frame interpolated last.
         ratio: alpha / alpha' in the I-frame before, (1 - alpha) / (1 - alpha') in the one after; alpha' of that frame.
         depth: `[H, W, 1]` that the points had in that frame, smaller is nearer; infinite, not positive or NaN where the
             search missed, or nothing is, which should not be followed. Without it each pixel keeps its own offset.

@@ -3,6 +3,7 @@
 From its first line on Ctrl-C ends it with one line and status 130, also while the rest is being imported.
 """
 
+import contextlib
 import os
 import signal
 import sys
@@ -25,7 +26,14 @@ def script() -> int:
     keep_compiled_programs()
     from jaxtrapolate.commands.main import main
 
-    return main()
+    status = main()
+    if status == 130:  # at once: threads that still write complain where Python takes itself down beneath them
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+        with contextlib.suppress(OSError, ValueError):
+            sys.stderr.flush()
+        os._exit(status)
+    return status
 
 
 if __name__ == "__main__":

@@ -20,8 +20,8 @@ from jaxtrapolate.runtime.output import writable_folder
 
 
 def file_name(text: str) -> str:
-    """A method's name as a part of a file's: what is more than letters, digits, dots and dashes is an underscore."""
-    return re.sub(r"[^\w.-]+", "_", text)
+    """The name of a file for a method as it was named, with its options: guided_warp_keep=1."""
+    return re.sub(r"[^\w.+=-]", "_", text)
 
 
 def eight_bit(image: Any) -> np.ndarray:

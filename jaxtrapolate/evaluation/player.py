@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxtrapolate.checks import check_present
 from jaxtrapolate.errors import InputError
 from jaxtrapolate.evaluation.schedule import Slot, needed_slots
 from jaxtrapolate.evaluation.windows import Window, arguments, load
@@ -101,7 +102,7 @@ def _structure(tree: Any) -> tuple[Any, ...]:
 
 def _size(history: Frames, target: Frame) -> tuple[int, ...]:
     newest = target if target.color is not None else history[rendered(history)[0]]
-    return jnp.shape(newest.color)[:2]
+    return check_present("color", newest.color, needed_by="the player").shape[:2]
 
 
 def play(

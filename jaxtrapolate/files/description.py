@@ -7,8 +7,7 @@ A full example, for a multi-layer render with PNG masks beside it:
     depth = "metric"                  # in the unit of position, or "ordinal": only larger = farther
     step = 1                          # from one frame's number to the next one's; by default it is found
     static_ids = [7, "9e3779b1"]      # ids of the stencil that do not move: walls that have an id, as they are stored
-    cuts = [48]                       # frames that begin another shot
-    larger = "../1080p"               # a folder of the same frames, 2, 3, ... times as large: truth of super sampling
+    cuts = [2]                        # frames that begin another shot
 
     [motion]                          # how motion vectors are stated; what is left out: the library's convention
     sign = "current_minus_previous"   # or "previous_minus_current"
@@ -68,6 +67,9 @@ renderers give walls an id too: without `static_ids` they count as moving object
 Flows are in the library's own convention, their third channel in the unit of position. Depth +inf is the sky. Ordinal
 depth may have 0 for its nearest value, and less: it is moved to positive numbers in the same order, v + 1/256, and
 below 0 to 1 / (256 - 65536 v).
+
+`larger = "../1080p"` names a folder of the same frames, 2, 3, ... times as large: the truth of methods that super
+sample.
 
 For the other readers the same file may hold `[motion]`, `name`, `step`, `static_ids`, `cuts` and `larger`; what
 `[motion]` leaves out keeps the reader's own default there.

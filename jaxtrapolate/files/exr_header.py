@@ -3,7 +3,7 @@
 OpenEXR prints to the terminal and drops whole parts when a file is cut short. This module finds that before the
 library sees the file, and gives sizes and channel names without decoding a pixel. The layout is that of the OpenEXR
 file format (openexr.com, "OpenEXR File Layout"): magic and version, one list of attributes a part, the table of the
-chunks' places, the chunks.
+chunks' offsets, the chunks.
 """
 
 import dataclasses
@@ -88,7 +88,7 @@ def check_limits(path: str | os.PathLike[str], parts: tuple[ExrPart, ...]) -> No
 
 
 def _parse(data: bytes) -> tuple[tuple[ExrPart, ...], int]:
-    """The parts and the place where the table of the chunks begins."""
+    """The parts and the offset at which the table of the chunks begins."""
     flags = struct.unpack_from("<I", data, 4)[0]
     position, parts = 8, []
     while True:
@@ -145,7 +145,7 @@ def _part(attributes: dict[str, bytes], flags: int) -> ExrPart:
 
 
 def _complete(stream: BinaryIO, parts: tuple[ExrPart, ...], position: int, length: int, multipart: bool) -> bool:
-    """Whether every chunk has a place and the last one ends within the file."""
+    """Whether every chunk has an offset and the last one ends within the file."""
     stream.seek(position)
     first = stream.read(8)
     if len(first) < 8:
@@ -153,7 +153,7 @@ def _complete(stream: BinaryIO, parts: tuple[ExrPart, ...], position: int, lengt
     bound = struct.unpack("<Q", first)[0]
     if not position < bound < length:
         return False
-    # The first chunk follows the table, so the table ends at the lowest place seen so far.
+    # The first chunk follows the table, so the table ends at the lowest offset seen so far.
     stream.seek(position)
     table = np.frombuffer(stream.read((bound - position) // 8 * 8), "<u8")
     ends = position + 8 * np.arange(1, len(table) + 1, dtype=np.uint64)

@@ -33,7 +33,7 @@ StaticId = int | str
 
 
 def plain(values: np.ndarray) -> np.ndarray:
-    """Which values stay as they are: integers from 0 to 2^24 (and NaN and infinities, which are invalid pixels)."""
+    """Which values stay unchanged: integers from 0 to 2^24 (and NaN and infinities, which are invalid pixels)."""
     if values.dtype.kind in "ui":
         return (values >= 0) & (values <= LARGEST)
     return ~np.isfinite(values) | ((values >= 0) & (values <= LARGEST) & (values == np.rint(values)))
@@ -87,7 +87,7 @@ def color_ids(codes: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Numbering:
-    """The numbers of all ids of a sequence that cannot stay as they are.
+    """The numbers of all ids of a sequence that cannot stay unchanged.
 
     stored: ascending, float64 (which holds every uint32 and every float32). given: the numbers, float32. hashes: as in
     the module's docstring. bits: whether the hashes are stored as floats.

@@ -100,7 +100,7 @@ def write_frame(path: str | os.PathLike[str], color: Any, hdr: bool, *, half: bo
     Args:
         path: where to; `.exr` or `.png` is appended, or exchanged for the other.
         color: linear radiance, a NumPy or JAX array.
-        hdr: EXR as it is, else an 8-bit sRGB PNG, clipped to 0..1.
+        hdr: EXR, unchanged, else an 8-bit sRGB PNG, clipped to 0..1.
         half: 16-bit floats in the EXR, else 32-bit.
 
     Returns:

@@ -27,7 +27,7 @@ def prefetch(
 
     Raises:
         ValueError: options out of range.
-        Exception: what reading a frame raised, in its place in the order.
+        Exception: what reading a frame raised, at its position in the order.
     """
     if ahead < 1 or keep < 0:
         raise ValueError(f"ahead, keep: expected at least 1 and 0, got {ahead} and {keep}")

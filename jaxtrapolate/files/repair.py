@@ -19,7 +19,7 @@ Any other pixel is invalid where one of its stored buffers is NaN or infinite (d
 - position is `LOST` in all components and normal is 0, so that `hole_masks` marks what is fetched from there;
 - every other buffer, colour included, takes the value of the nearest pixel at which that buffer is finite (0 where it
   has none, depth +inf; of depth, the nearest pixel where it is known, be it +inf); buffers that are finite there are
-  left as they are.
+  left unchanged.
 
 History and truth go through this alike. Scores leave invalid pixels out (`Sequence.invalid`).
 """

@@ -175,7 +175,7 @@ def write_unreal_frame(
     """Write a frame as `UnrealSequence` reads it, one file for each buffer that is there, each in full or not at all.
 
     Args:
-        folder: made where it does not exist.
+        folder: created where it does not exist.
         scene: the first part of the files' names.
         number: of the frame, at least four digits in the files' names.
         frame: in the library's conventions.

@@ -81,8 +81,9 @@ def _search(state, values: Values):
         choice=how.choice,
         epsilon=how.epsilon_error,
     )
-    limits = {"epsilon_depth": how.epsilon_depth, "epsilon_trip": how.epsilon_trip}
-    visible = VisibilityOptions(test=how.visibility, depth=kind, **limits)
+    visible = VisibilityOptions(
+        test=how.visibility, depth=kind, epsilon_depth=how.epsilon_depth, epsilon_trip=how.epsilon_trip
+    )
     made = interpolate_bidirectional(first, second, values["alpha"], search=search, visibility=visible).color
     return {"image": jnp.where(made == first.color, jnp.asarray(previous.color), expand(made))}
 

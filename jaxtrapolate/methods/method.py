@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.checks import check_choice, missing_package
 from jaxtrapolate.methods.options import Option, options_of, replaced
 from jaxtrapolate.ops.depth import surfaces
+from jaxtrapolate.ops.jitter import on_own_pixels
 from jaxtrapolate.records import Frame, check_frame, record
 from jaxtrapolate.records import replace as exchange
 
@@ -433,7 +434,15 @@ class Method:
         return self._advance(stages[: names.index(stage)], state, carry, history, target, future)
 
     def first_values(self, carry: Any, history: Frames, target: Frame, future: Frames = ()) -> dict[str, Any]:
-        """What the first stage gets: the frames, whose depth is +inf where no surface was hit (`surface_depth`)."""
+        """What the first stage gets.
+
+        The frames, whose depth is +inf where no surface was hit (`surface_depth`), and whose motion and cameras lead to
+        pixels where frames are jittered (`jaxtrapolate.ops.jitter`).
+        """
+        before = target if target.motion is not None or not history else history[-1]
+        future = on_own_pixels((before, *future))[1:]
+        frames = on_own_pixels((*history, target))
+        history, target = frames[:-1], frames[-1]
         given, past, coming = (tuple(map(self._prepared, frames)) for frames in ((target,), history, future))
         values = {"carry": carry, "history": past, "target": given[0], "future": coming}
         return values if target.color is None or self.scale != 1 else values | {"image": jnp.asarray(target.color)}

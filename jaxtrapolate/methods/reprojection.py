@@ -17,6 +17,7 @@ from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.stages import REPROJECT, SKY
 from jaxtrapolate.ops.depth import changed
 from jaxtrapolate.ops.fill import fill_around
+from jaxtrapolate.ops.jitter import jitter_difference, shift_motion
 from jaxtrapolate.ops.scatter import splat_nearest
 from jaxtrapolate.ops.warp import backward_warp, in_frame
 from jaxtrapolate.precision import widest
@@ -114,11 +115,18 @@ NEWEST = Stage("newest", _newest, ("history", "target"), ("newest", "steps"), re
 
 
 def _linear(state, values: Values):
-    motion = values["newest"].motion
-    return {"linear": -values["steps"].astype(motion.dtype) * motion}
+    history, target = values["history"], values["target"]
+    index = rendered(history)[0]
+    newest, motion = history[index], history[index].motion
+    if index and (difference := jitter_difference(newest, history[index - 1])) is not None:
+        motion = motion - difference.astype(motion.dtype)  # surfaces move, whatever the jitter does
+    along = -values["steps"].astype(motion.dtype) * motion
+    return {"linear": shift_motion(along, newest, target)}
 
 
-LINEAR = Stage("linear motion", _linear, ("newest", "steps"), ("linear",), reads=("history.motion",), optional=True)
+LINEAR = Stage(
+    "linear motion", _linear, ("history", "target", "steps"), ("linear",), reads=("history.motion",), optional=True
+)
 """The motion to the frame before, turned around and scaled by time: all goes on moving on the screen as it did."""
 
 

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxtrapolate.checks import check_image
+from jaxtrapolate.checks import ArrayLike, check_image
 from jaxtrapolate.precision import divide, widest
 
 _SIGMA = 1.5
 _RADIUS = 5  # an 11 x 11 window
 
 
-def counted(mask: Array) -> Array:
+def counted(mask: ArrayLike) -> ArrayLike:
     """Where a mask, bool or weights, is more than nothing."""
     return mask if mask.dtype == bool else mask > 0
 
@@ -39,7 +39,7 @@ def _squared_error(first, second, mask):
     return _mean(jnp.square(first - second), mask)
 
 
-def check_pair(first: Array, second: Array, mask: Array | None) -> None:
+def check_pair(first: ArrayLike, second: ArrayLike, mask: ArrayLike | None) -> None:
     """Raises where two images and a mask do not fit each other.
 
     Args:
@@ -108,7 +108,7 @@ def psnr(
 
 
 def _blur(image):
-    """The Gaussian of an 11 x 11 window over the places where it fits, `[H - 10, W - 10, C]`."""
+    """The Gaussian of an 11 x 11 window at the positions where it fits, `[H - 10, W - 10, C]`."""
     offsets = np.arange(-_RADIUS, _RADIUS + 1)
     kernel = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
     kernel = kernel / kernel.sum()

@@ -78,18 +78,18 @@ def flip_map(
     """
     check_installed("flip")
     truth = _concrete("reference", reference)
-    made = _concrete("image", image, like=truth)
+    generated = _concrete("image", image, like=truth)
     parameters: dict[str, float] = {}
     if pixels_per_degree is not None:
         if not pixels_per_degree > 0:
             raise ValueError(f"pixels_per_degree: expected a positive number, got {pixels_per_degree}")
         parameters["ppd"] = float(pixels_per_degree)
-    made, truth = (np.clip(a, 0, None if hdr else 1) for a in (made, truth))
+    generated, truth = (np.clip(a, 0, None if hdr else 1) for a in (generated, truth))
     if hdr and np.max(truth @ _LUMINANCE) <= 2 * _DARKEST:  # the package would end the process
         stop = math.log2(2.1189 / _DARKEST)
         parameters |= {"startExposure": stop, "stopExposure": stop, "numExposures": 2}
     evaluate = importlib.import_module("flip_evaluator").evaluate
-    error, _, _ = evaluate(truth, made, "HDR" if hdr else "LDR", not hdr, False, False, parameters)
+    error, _, _ = evaluate(truth, generated, "HDR" if hdr else "LDR", not hdr, False, False, parameters)
     return np.asarray(error, np.float32)
 
 
@@ -146,8 +146,8 @@ def lpips(
     """Learned perceptual image patch similarity: the weighted squared distance of two images' deep features.
 
     Args:
-        image: `[H, W, 3]`, display values in 0..1 (scaled to the network's -1..1 within), at least 31 x 31 for "alex" and
-            16 x 16 for "vgg". Computed in at least float32, at the highest precision of products.
+        image: `[H, W, 3]`, display values in 0..1 (scaled to the network's -1..1 within), at least 31 x 31 for "alex"
+            and 16 x 16 for "vgg". Computed in at least float32, at the highest precision of products.
         reference: the ground truth, likewise.
         net: "alex" is the better and faster score, "vgg" the smoother loss.
         weights: of `network_weights(net)`, by default those. Under jit hand them over as an argument, or they become
@@ -217,7 +217,7 @@ def _compare(frames: Frames, reference: Frames, *, least: int, filter: str, log:
     check_installed("vmaf")
     with tempfile.TemporaryDirectory(prefix="jaxtrapolate-") as name:
         folder = Path(name)
-        count, size = _write_raw("frames", frames, folder / "made.rgb")
+        count, size = _write_raw("frames", frames, folder / "frames.rgb")
         other, expected = _write_raw("reference", reference, folder / "reference.rgb")
         if (count, size) != (other, expected):
             what = "frames of {} x {}"
@@ -229,7 +229,7 @@ def _compare(frames: Frames, reference: Frames, *, least: int, filter: str, log:
         luma = "scale=in_range=pc:out_range=tv:out_color_matrix=bt709:flags=accurate_rnd+bitexact,format=yuv444p"
         graph = f"[0:v]{luma}[a];[1:v]{luma}[b];[a][b]{filter}"
         program = importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
-        command = [program, "-hide_banner", "-nostdin", "-loglevel", "error", *raw, "made.rgb", *raw, "reference.rgb"]
+        command = [program, "-hide_banner", "-nostdin", "-loglevel", "error", *raw, "frames.rgb", *raw, "reference.rgb"]
         done = subprocess.run(
             [*command, "-lavfi", graph, "-f", "null", "-"], cwd=folder, capture_output=True, check=False
         )
@@ -271,7 +271,7 @@ def vmaf(frames: Frames, reference: Frames, *, model: VmafModel = "vmaf_v0.6.1",
 
 
 def xpsnr(frames: Frames, reference: Frames) -> ClipScore:
-    """Extended perceptually weighted PSNR of a clip's luma in dB: errors weigh less in busy and moving places.
+    """Extended perceptually weighted PSNR of a clip's luma in dB: errors weigh less in busy and moving regions.
 
     Args:
         frames: the generated clip, as for `vmaf`, of any size.

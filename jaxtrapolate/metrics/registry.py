@@ -17,10 +17,10 @@ METRICS = {"psnr": psnr, "ssim": ssim}
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """A metric as `load` gives it: called with what was made and the truth, it returns a float.
+    """A metric as `load` gives it: called with a generated image and the ground truth, it returns a float.
 
     A mask `[H, W, 1]` says which pixels count. "psnr" and "ssim" look at those alone. The other metrics of frames look
-    at neighbourhoods: there the pixels left out are first made equal, to the reference's or, where that is not finite,
+    at neighbourhoods: there the pixels left out are first set equal, to the reference's or, where that is not finite,
     to 0; they carry no error of their own and still count in the mean.
 
     Attributes:
@@ -78,7 +78,7 @@ def metric_names() -> tuple[str, ...]:
 
 
 def load(name: str) -> Metric:
-    """A metric by name: `load("flip")(made, truth)` is a float.
+    """A metric by name: `load("flip")(generated, truth)` is a float.
 
     Args:
         name: "psnr", "ssim"; "flip" (LDR), "flip_hdr"; "lpips" (AlexNet), "lpips_vgg"; "vmaf", "xpsnr" (clips). All

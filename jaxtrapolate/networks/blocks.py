@@ -1,4 +1,4 @@
-"""What the networks are made of: a layer (convolution, gate, batch norm, activation), doubling, padding.
+"""The building blocks of the networks: a layer (convolution, gate, batch norm, activation), doubling, padding.
 
 Convention:
     `[B, H, W, C]`, channels last, with a leading batch axis (Flax NNX; a function of one frame without it is
@@ -169,7 +169,7 @@ class Layer(nnx.Module):
         self.norm = nnx.data(None)
 
 
-def _double(x, axis, aligned):
+def _upsample_axis_2x(x, axis, aligned):
     n = x.shape[axis]
     place = np.arange(2 * n) * ((n - 1) / (2 * n - 1)) if aligned else np.minimum(np.arange(2 * n) / 2, n - 1)
     lower = np.minimum(np.floor(place).astype(np.int32), max(n - 2, 0))
@@ -181,17 +181,17 @@ def _double(x, axis, aligned):
     return before * jnp.asarray(1 - share, x.dtype) + behind * jnp.asarray(share, x.dtype)
 
 
-def double(x: Float[Array, "b h w c"], *, aligned: bool = True) -> Float[Array, "b i j c"]:
+def upsample_2x(x: Float[Array, "b h w c"], *, aligned: bool = True) -> Float[Array, "b i j c"]:
     """Twice the height and width, bilinear.
 
     With aligned corners output k is the input at k (n - 1) / (2n - 1). Without, it is the input at k / 2, the last
-    repeated: pixels stay where a convolution of stride 2 has put them, and a flow is doubled by 2. Places and weights
-    are fixed when tracing; rows are gathered, then columns.
+    repeated: pixels stay where a convolution of stride 2 has put them, and a flow is doubled by 2. Positions and
+    weights are fixed when tracing; rows are gathered, then columns.
     """
-    return _double(_double(x, 1, aligned), 2, aligned)
+    return _upsample_axis_2x(_upsample_axis_2x(x, 1, aligned), 2, aligned)
 
 
-def shuffle(x: Float[Array, "b h w c"]) -> Float[Array, "b i j d"]:
+def pixel_shuffle(x: Float[Array, "b h w c"]) -> Float[Array, "b i j d"]:
     """Twice the height and width, a quarter of the channels: each pixel's quarters become 2 x 2 pixels, row by row."""
     batch, height, width, channels = x.shape
     x = x.reshape(batch, height, width, 2, 2, channels // 4)
@@ -199,11 +199,11 @@ def shuffle(x: Float[Array, "b h w c"]) -> Float[Array, "b i j d"]:
 
 
 def pad_to_multiple(x: Float[Array, "b h w c"], multiple: int) -> Float[Array, "b i j c"]:
-    """The frame made larger, at the bottom and on the right, to a multiple of `multiple`, by mirroring it at its edge.
+    """The frame padded, at the bottom and on the right, to a multiple of `multiple`, by mirroring it at its edge.
 
-    The pixels keep their place on every level of a network; crop its result by `y[:, :height, :width]`. Within 8 pixels
-    of the padding zeros cost the trained ExtraNet 1.2 to 3.1 times the error of mirroring, repeating the edge 1.0 to
-    1.5 times (its official test frames cropped to five sizes, against the whole frames' results).
+    The pixels keep their position on every level of a network; crop its result by `y[:, :height, :width]`. Within 8
+    pixels of the padding zeros cost the trained ExtraNet 1.2 to 3.1 times the error of mirroring, repeating the edge
+    1.0 to 1.5 times (its official test frames cropped to five sizes, against the whole frames' results).
     """
     _, height, width, _ = x.shape
     return jnp.pad(x, ((0, 0), (0, -height % multiple), (0, -width % multiple), (0, 0)), mode="symmetric")

@@ -14,7 +14,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_array, check_present
-from jaxtrapolate.networks.blocks import HE, LINEAR, Gate, Layer, double, pad_to_multiple
+from jaxtrapolate.networks.blocks import HE, LINEAR, Gate, Layer, pad_to_multiple, upsample_2x
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +149,7 @@ class ExtraNet(nnx.Module):
         if history is not None:
             value = jnp.concatenate([value, self._encode(history)], -1)
         for level in self.decoder:
-            value = level(jnp.concatenate([skips.pop(), double(value)], -1))
+            value = level(jnp.concatenate([skips.pop(), upsample_2x(value)], -1))
         residual = self.output(value)[:, :height, :width]
         return x[..., :3] + residual.astype(x.dtype)
 

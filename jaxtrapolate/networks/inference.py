@@ -30,7 +30,7 @@ def inference(model: nnx.Module, *, dtype: Any = jnp.float32) -> tuple[Callable[
     """A model in evaluation as a pure function: `function(state, *inputs)` is the result of one frame.
 
     Args:
-        model: made of `Layer`s, whose batch norms are folded, see `fold`.
+        model: built of `Layer`s, whose batch norms are folded, see `fold`.
         dtype: of the weights, and so of all that is computed by them. What a model corrects (the warped image in
             `ExtraNet`) stays in the dtype of the inputs: give them in float32.
 

@@ -18,7 +18,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_array
-from jaxtrapolate.networks.blocks import HE, Layer, double, pad_to_multiple, shuffle
+from jaxtrapolate.networks.blocks import HE, Layer, pad_to_multiple, pixel_shuffle, upsample_2x
 from jaxtrapolate.ops.warp import landing, sample
 from jaxtrapolate.precision import widest
 
@@ -53,7 +53,7 @@ class Decoder(nnx.Module):
 
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b i j d"]:
         hidden = self.join(x)
-        return shuffle(self.head(hidden + self.refine(hidden)))
+        return pixel_shuffle(self.head(hidden + self.refine(hidden)))
 
 
 @jax.vmap
@@ -142,7 +142,7 @@ class Interpolator(nnx.Module):
         flow = code[..., :4].astype(wide)
         for decoder in finer:
             code = decoder(join(code[..., 4:], *fetch(pyramid.pop(), flow), flow))
-            flow = 2 * double(flow, aligned=False) + code[..., :4].astype(wide)
+            flow = 2 * upsample_2x(flow, aligned=False) + code[..., :4].astype(wide)
         a, b = fetch(frames, flow)
         code = code.astype(wide)
         mask, residual = jax.nn.sigmoid(jnp.clip(code[..., 4:5], -10, 10)), code[..., 5:]

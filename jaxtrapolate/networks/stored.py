@@ -19,7 +19,7 @@ def load_network(
     Args:
         path: of a file or folder, see `read_weights`.
         method: whose weights these have to be.
-        build: gives, for what the file states, the function that makes the network. It is never run, only traced.
+        build: gives, for what the file states, the function that builds the network. It is never run, only traced.
 
     Raises:
         OSError: the file cannot be read.

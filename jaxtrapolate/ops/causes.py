@@ -28,9 +28,9 @@ def disoccluded(target: Keyframe, source: Keyframe) -> Bool[Array, "h w"]:
     """Whether the surface at a target pixel was hidden in the source frame: exact, by depth.
 
     The depth that the surface had in the source frame, depth + the backward flow's change, is more than 2 % beyond the
-    source's depth (bilinear) at the place where the backward flow leads. False beyond the frame. Where one shows
-    nothing (depth that is not positive, or infinite; in the source at the pixel nearest to that place) and the other a
-    surface, it was hidden or not there; where both show nothing it was not.
+    source's depth (bilinear) at the position that the backward flow leads to. False beyond the frame. Where one shows
+    nothing (depth that is not positive, or infinite; in the source at the pixel nearest to that position) and the other
+    a surface, it was hidden or not there; where both show nothing it was not.
 
     Args:
         target: with depth and backward_flow.

@@ -1,7 +1,7 @@
 """The camera's own motion, found from depth and motion vectors, and which objects move as it does.
 
-A point of a static scene at pixel (x, y) and depth z is seen by a pinhole camera that moved at a place that is linear
-in homogeneous coordinates: (u, v, w) = M (x, y, 1, 1 / z), at (u / w, v / w), whatever the focal lengths of both
+A point of a static scene at pixel (x, y) and depth z is seen by a pinhole camera that moved at a position that is
+linear in homogeneous coordinates: (u, v, w) = M (x, y, 1, 1 / z), at (u / w, v / w), whatever the focal lengths of both
 cameras (M is K' [R K^-1 | t] up to scale). So the motion of all that is static follows from one matrix of 3 x 4, which
 is fitted to points by the direct linear transform (Hartley & Zisserman, Multiple View Geometry, section 4.1), and to
 those of one motion among several by random samples (Fischler & Bolles 1981). Computed in float64 on the host.

@@ -52,7 +52,7 @@ def fill_pyramid(image: Float[ArrayLike, "h w c"], covered: Bool[ArrayLike, "h w
         covered: bool `[H, W]`, False in holes.
 
     Returns:
-        `[H, W, C]`; covered pixels as they are, bit for bit. Holes in a constant image get the constant. Zero where
+        `[H, W, C]`; covered pixels unchanged, bit for bit. Holes in a constant image get the constant. Zero where
         nothing at all is covered.
 
     Edge cases:
@@ -66,7 +66,7 @@ def fill_pyramid(image: Float[ArrayLike, "h w c"], covered: Bool[ArrayLike, "h w
         TypeError, ValueError: no floating-point image, no bool mask, or sizes that differ.
 
     References:
-        Gortler et al. 1996 (The lumigraph), section 4.4; in the place of the hole filling in several scales of
+        Gortler et al. 1996 (The lumigraph), section 4.4; instead of the hole filling in several scales of
         Schollmeyer et al. 2017. Departure: coverage is 0 or 1 at every level. To take only the farther pixels of each
         block, as holes show background, gained nothing on embedded scenes.
     """
@@ -131,7 +131,7 @@ def fill_around(
             it the closest of the four pixels is taken.
 
     Returns:
-        `[H, W, C]`; covered pixels as they are. Of equal depths the closest, then left before right before above. Zero
+        `[H, W, C]`; covered pixels unchanged. Of equal depths the closest, then left before right before above. Zero
         where nothing is covered in a hole's row and column. NaN depth counts as nearest.
 
     Gradient:

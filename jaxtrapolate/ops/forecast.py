@@ -1,7 +1,7 @@
 """A target frame where nothing was drawn for it: the newest frame's motion carried on.
 
-For sequences whose frames are all rendered, extrapolating methods still need a target's buffers. They are made from the
-newest frame's: each surface goes on moving as it did.
+For sequences whose frames are all rendered, extrapolating methods still need a target's buffers. They are derived from
+the newest frame's: each surface goes on moving as it did.
 """
 
 import jax
@@ -21,7 +21,7 @@ def forecast(frame: Frame, fraction: float | Float[Array, ""]) -> Frame:
     """The buffers of a frame `fraction` of a frame step after `frame`, if everything goes on moving as it does.
 
     The motion to the previous frame, reversed and scaled by `fraction`, is splatted along itself, the nearest depth
-    winning; where nothing lands the place keeps its own. Buffers are fetched along the result, from the nearest pixel.
+    winning; where nothing lands the pixel keeps its own. Buffers are fetched along the result, from the nearest pixel.
     What comes into view is unknown, and what turns or accelerates is wrong by that: an approximation, unlike the drawn
     buffers of a frame.
 

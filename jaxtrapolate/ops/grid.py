@@ -60,7 +60,7 @@ def _turns(corners: list[Array]) -> Array:
 
 
 def _snapped(depth: Array, x: np.ndarray, y: np.ndarray, cell: int) -> Array:
-    """Vertices `[J, I, 2]` (x, y), whole pixels: the closest rim of a near surface in reach, else the regular place.
+    """Vertices `[J, I, 2]` (x, y), whole pixels: the closest rim of a near surface in reach, else the regular position.
 
     Vertices at the border stay there, and a vertex whose cell would no longer be convex goes back.
     """
@@ -99,7 +99,7 @@ def _bilinear(corners: Sequence[Array], u: Array, v: Array) -> Array:
 
 
 def _inverse(corners: Array, target: tuple[Array, Array], start: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Where (u, v) in a cell a point (x, y) is, by Newton's method from a place near by; corners `[4, 2, ...]`."""
+    """Where (u, v) in a cell a point (x, y) is, by Newton's method from a position near by; corners `[4, 2, ...]`."""
     x, y = ([corners[k, axis] for k in range(4)] for axis in (0, 1))
 
     def slopes(p, u, v):

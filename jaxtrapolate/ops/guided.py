@@ -1,8 +1,8 @@
 """G-buffer-guided warping (Wu et al. 2023, ExtraSS, section 4.2).
 
-Around the place where the motion leads, candidate pixels are compared with the target pixel by their guides (albedo,
-normals) and by their distance on the screen; the best few are blended. It is a joint bilateral filter that reaches past
-an occluder for a like surface, so that it fills disoccluded pixels as well.
+Around the position that the motion leads to, candidate pixels are compared with the target pixel by their guides
+(albedo, normals) and by their distance on the screen; the best few are blended. It is a joint bilateral filter that
+reaches past an occluder for a like surface, so that it fills disoccluded pixels as well.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ def guided_taps(strides: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def _nearest(position, reach, size):
-    """The pixel nearest to the landing place, held within one more than the kernels' reach of the frame."""
+    """The pixel nearest to the displaced position, held within one more than the kernels' reach of the frame."""
     return jnp.clip(jnp.floor(jax.lax.stop_gradient(position) + 0.5), -reach - 1, size + reach).astype(jnp.int32)
 
 
@@ -46,9 +46,9 @@ def _factors(sigma_guide, sigma_space):
     """The smaller sigma, and what squared differences are weighted with relative to it.
 
     cost = guide * |guide difference|^2 + space * |distance|^2 is then 2 m^2 times the negative logarithm of the weight:
-    the order is kept, and no sigma makes it over- or underflow.
+    the order is kept, and it neither over- nor underflows for any sigma.
     """
-    # below this a cube underflows float32, and XLA makes one division of several: 0 / 0
+    # below this a cube underflows float32, and XLA merges several divisions into one: 0 / 0
     sigma_guide, sigma_space = (jnp.where(sigma > _LEAST, sigma, _LEAST) for sigma in (sigma_guide, sigma_space))
     m = jnp.minimum(sigma_guide, sigma_space)
     return m, (m / sigma_guide) ** 2, (m / sigma_space) ** 2
@@ -59,7 +59,7 @@ def _select(x, y, target, padded, guide_factor, space_factor, *, shape, reach, t
 
     A tap's key is its cost, as an integer of the same order, with the tap's number in the lowest six bits: costs that
     differ by less than 2^-17 of their value count as equal, and ties go to the earlier tap. All taps and their ranking
-    are one pass over the pixels with one output, so that XLA makes one loop of it.
+    are one pass over the pixels with one output, so that XLA fuses it into one loop.
     """
     height, width = shape
     border = 2 * reach + 1
@@ -90,7 +90,7 @@ def _select(x, y, target, padded, guide_factor, space_factor, *, shape, reach, t
 
 
 def _blend(code, x, y, image, target, source, smaller, guide_factor, space_factor, *, reach, taps, keep):
-    """The weighted mean of the selected taps, weights from the guides as they are; differentiable."""
+    """The weighted mean of the selected taps, weights from the unquantised guides; differentiable."""
     height, width, channels = image.shape
     column, row = _nearest(x, reach, width), _nearest(y, reach, height)
     nearest = jnp.clip(row, 0, height - 1) * width + jnp.clip(column, 0, width - 1)
@@ -205,7 +205,7 @@ def guided_warp(
     keep: int = 4,
     guides: Guides = "float32",
 ) -> Float[Array, "h w c"]:
-    """The image fetched along the motion, from the most similar of the pixels around the landing place.
+    """The image fetched along the motion, from the most similar of the pixels around the displaced position.
 
     w(y) = exp(-|target_guide(p) - source_guide(y)|^2 / (2 sigma_guide^2))
          * exp(-|p + motion[p] - y|^2 / (2 sigma_space^2)) for the taps y; the `keep` largest are normalised, blended.
@@ -216,7 +216,7 @@ def guided_warp(
         target_guide: `[H, W, G]`, albedo and normal in the paper.
         source_guide: of the source frame, likewise.
         strides: of the 3 x 3 kernels, all distinct, 1 to 7 of them. The taps are the distinct pixels round(p +
-            motion[p]) + stride * (k, l); distances are measured from the unrounded place.
+            motion[p]) + stride * (k, l); distances are measured from the unrounded position.
         sigma_guide: in units of the guides.
         sigma_space: in pixels. Both > 0 (below 1e-12 they count as that); traced, so that they can be fitted.
         keep: how many taps are blended, 1 to 5.
@@ -232,10 +232,10 @@ def guided_warp(
 
     Edge cases:
         Taps outside the frame, or with guides that are not finite, have no weight. Where no tap is left the pixel of
-        the frame nearest to the landing place is taken. Motion that is not finite counts as 0. Ties (costs that differ
-        by less than 2^-17 of their value) go to the first tap: the centre, then stride by stride, row by row. Weights
-        are compared and normalised as logarithms, so that no sigma underflows. Zero motion returns the image where the
-        kept neighbours have no weight beside the centre, not in general: this is a filter.
+        the frame nearest to the displaced position is taken. Motion that is not finite counts as 0. Ties (costs that
+        differ by less than 2^-17 of their value) go to the first tap: the centre, then stride by stride, row by row.
+        Weights are compared and normalised as logarithms, so that no sigma underflows. Zero motion returns the image
+        where the kept neighbours have no weight beside the centre, not in general: this is a filter.
 
     Gradient:
         With respect to image, motion, both guides and both sigmas, through the weights of the taps that are kept; which
@@ -283,7 +283,7 @@ def far_motion(
 ) -> Float[Array, "h w 2"]:
     """The motion, in holes led on to the nearest like surface further away than `guided_warp` looks.
 
-    Its kernels reach 10 pixels, which a hole of a large frame is wider than. Here the same search is made among every
+    Its kernels reach 10 pixels, which a hole of a large frame is wider than. Here the same search runs among every
     `step`-th pixel of every `step`-th row, so that it reaches that many times as far at 1 / step^2 of the cost; a hole
     whose guides differ where the motion leads goes where its block's pixel found the best tap. Ours, no paper's.
 
@@ -293,14 +293,15 @@ def far_motion(
         source_guide: `[H, W, G]`.
         holes: where the motion may be changed.
         step: in pixels, >= 1.
-        unlike: squared difference of the guides, at the pixel nearest to the landing place, above which it is changed.
+        unlike: squared difference of the guides, at the pixel nearest to the displaced position, above which it is
+            changed.
 
     Returns:
         `[H, W, 2]`. Its derivative is that of the motion: what was added is held fixed.
 
     Edge cases:
         What lies out of the frame by more than the search's reach is led to the frame's edge. Where a guide is not
-        finite, or the motion, it is left as it is.
+        finite, or the motion, it is left unchanged.
     """
     motion, target_guide, source_guide = (jnp.asarray(a) for a in (motion, target_guide, source_guide))
     height, width, _ = motion.shape

@@ -31,7 +31,7 @@ Taps = Literal["weighted", "nearest", "release"]
 class HoleMasks:
     """Masks `[H, W, 1]`, True (or towards 1, where softness > 0) where a warped pixel is invalid; `None` = no buffers.
 
-    stencil: another dynamic object. normal: another side of one. position: another place of the static scene. depth:
+    stencil: another dynamic object. normal: another side of one. position: another point of the static scene. depth:
     nothing instead of a surface, or a surface instead of nothing. outside: beyond the frame.
     """
 
@@ -65,7 +65,7 @@ class _Bare(NamedTuple):
 
 
 def _taps_around(image: Array, pair: Pair, taps: Taps) -> list[tuple[Array, Array]]:
-    """The pixels that count around each landing position and their weights `[H, W, 1]`; one, or four."""
+    """The pixels that count around each displaced position and their weights `[H, W, 1]`; one, or four."""
     if taps == "nearest":
         return [(sample(image, pair.x, pair.y, filter="nearest"), jnp.ones((*pair.x.shape, 1), pair.x.dtype))]
     return bilinear_taps(image, pair.x, pair.y)

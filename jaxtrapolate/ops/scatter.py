@@ -82,7 +82,7 @@ def splat_nearest(
         motion: `[H, W, 2]` in pixels.
         depth: `[H, W, 1]`, smaller is nearer; what is not positive is nothing, and as far as +inf
             (`jaxtrapolate.ops.depth`).
-        footprint: 4, the four pixel centres around the landing place (a point that lands on a centre also covers the
+        footprint: 4, the four pixel centres around the landing position (a point that lands on a centre also covers the
             next ones right and down, as a cell of pixels does), or 1, the nearest centre (ties right and down).
 
     Returns:
@@ -194,8 +194,8 @@ def splat(
         that no size of the weights over- or underflows there.
 
     Gradient:
-        With respect to values, motion and weights, exact away from kinks; at a landing place on a pixel centre, that of
-        the move to the right and down. 0 in holes and for what lands outside.
+        With respect to values, motion and weights, exact away from kinks; at a landing position on a pixel centre, that
+        of the move to the right and down. 0 in holes and for what lands outside.
 
     Raises:
         TypeError, ValueError: no floating-point array, a shape that does not fit, an unknown mode, or weights that are

@@ -22,7 +22,7 @@ def rows_of(image: Array, top: Array | int, rows: int) -> Array:
 def by_strips(function: Callable[..., T], height: int, sources: Any) -> T:
     """function(sources, top, rows) for all rows 0 .. height: arrays `[height, ...]`; on a CPU strip by strip.
 
-    The function makes rows top .. top + rows from any part of the sources, and must not close over traced values.
+    The function computes rows top .. top + rows from any part of the sources, and must not close over traced values.
     Differentiated, it is called once for all rows: of strips each would have a gradient of the size of the sources.
     """
 
@@ -33,13 +33,13 @@ def by_strips(function: Callable[..., T], height: int, sources: Any) -> T:
         part = jax.jit(partial(function, rows=_ROWS))  # traced once
         example = jax.eval_shape(part, sources, jnp.zeros((), jnp.int32))
         shapes, tree = jax.tree.flatten(example)
-        # of different numbers: equal arrays would be made once and copied
+        # of different numbers: equal arrays would be allocated once and copied
         empty = tree.unflatten([jnp.full((height, *a.shape[1:]), k, a.dtype) for k, a in enumerate(shapes)])
 
-        def step(number, made):
+        def step(number, result):
             top = jnp.minimum(number * _ROWS, height - _ROWS).astype(jnp.int32)  # the last one may repeat rows
-            made_now = part(sources, top)
-            return jax.tree.map(lambda a, b: jax.lax.dynamic_update_slice_in_dim(a, b, top, 0), made, made_now)
+            strip = part(sources, top)
+            return jax.tree.map(lambda a, b: jax.lax.dynamic_update_slice_in_dim(a, b, top, 0), result, strip)
 
         return jax.lax.fori_loop(0, -(-height // _ROWS), step, empty)
 

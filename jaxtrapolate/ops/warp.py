@@ -252,7 +252,7 @@ def backward_warp(
     Exactness:
         Zero motion returns the image bit for bit; an integer shift returns the shifted image bit for bit (a negative
         zero may lose its sign, and a number below 2^-126 may become 0). A pixel contributes only where its weight is
-        not 0: a NaN or infinity beside a landing place on a pixel does not spread.
+        not 0: a NaN or infinity beside a displaced position on a pixel does not spread.
 
     Edge cases:
         NaN or infinite motion gives the outside value, with "edge" the pixel p itself (of the nearest place in the

@@ -1,4 +1,4 @@
-"""Pictures in a page: data URIs, made small."""
+"""Pictures in a page: data URIs, scaled down."""
 
 import base64
 import io

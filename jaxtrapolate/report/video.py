@@ -43,7 +43,7 @@ def side_by_side(pictures: Sequence[UInt8[np.ndarray, "h w 3"]], labels: Sequenc
     """Pictures of one size in as many columns as keep them largest within 1920 x 1080, a label above each.
 
     Args:
-        pictures: `[H, W, 3]`, uint8. Large ones are made smaller; ones too small for a label are magnified by a whole
+        pictures: `[H, W, 3]`, uint8. Large ones are scaled down; ones too small for a label are magnified by a whole
             factor.
         labels: one each.
 

@@ -27,7 +27,7 @@ from jaxtrapolate.errors import InputError
 from jaxtrapolate.files.sequence import Sequence
 
 RECORD = "run.json"
-"""The file in an output folder that says what made its content."""
+"""The file in an output folder that says what generated its content."""
 _LOCK = ".run.lock"
 _WRITES = {
     "generate": ("generate.json", "[-0-9]*.exr", "[-0-9]*.png"),
@@ -160,7 +160,7 @@ def open_output(
         if record is None:
             if writes and (found := _found(path, command)):
                 raise InputError(
-                    f"{path}: holds {found}, and no {RECORD} that says what made it; choose another folder"
+                    f"{path}: holds {found}, and no {RECORD} that says what generated it; choose another folder"
                 )
             record = {"settings": settings, "code": code(), "parts": {}}
             output = Output(path, record, writes=writes)

@@ -1,7 +1,7 @@
 """Rays against all primitives of a scene: the first hit, the blocking of lights, the nearness of other surfaces.
 
 Each function loops over the primitives of one shape after the other, with planar arrays of rays. The state of a loop is
-one array: XLA's CPU compiler makes one kernel for each output of a step and would compute the intersection in each.
+one array: XLA's CPU compiler compiles one kernel for each output of a step and would compute the intersection in each.
 A primitive never hides or shadows itself, being convex, so a ray that leaves a surface needs no offset: it is told
 which primitive it leaves (`own`).
 """

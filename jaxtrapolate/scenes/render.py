@@ -230,7 +230,7 @@ def _traced(
 ) -> Vector:
     """`_bounce` where the surface is smooth enough for it to count, 0 elsewhere: packs of such pixels, one by one.
 
-    What a pack reads and makes is gathered and scattered; a frame without a mirror costs nothing.
+    What a pack reads and writes is gathered and scattered; a frame without a mirror costs nothing.
     """
     shape = s.width.shape
     total = math.prod(shape)
@@ -351,9 +351,9 @@ def _render(
             "motion": (there.x - here.x, there.y - here.y),
         }
 
-    made = planes(s, hit.t, d, color, shadow)
-    motion = jnp.stack(made.pop("motion"), axis=-1)
-    gbuffer = {name: v.stack() if isinstance(v, Vector) else v[..., None] for name, v in made.items()}
+    buffers = planes(s, hit.t, d, color, shadow)
+    motion = jnp.stack(buffers.pop("motion"), axis=-1)
+    gbuffer = {name: v.stack() if isinstance(v, Vector) else v[..., None] for name, v in buffers.items()}
     objects = _object_motion(scene, poses)
     return Frame(color.stack(), GBuffer(**gbuffer), motion, matrices(view, size), jitter, time, objects)
 

@@ -102,7 +102,7 @@ class CameraPath:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Everything that `render` needs; made by `scene`.
+    """Everything that `render` needs; built by `scene`.
 
     Primitives are numbered shape by shape in the order of `primitives.KINDS`, as in `counts` in each, then the
     height field. rotation `[P, 3, 3]`, centre `[P, 3]`: pose in the body's space. size `[P, 3]`: see `primitives`.
@@ -183,7 +183,7 @@ def material(color: object, **columns: object) -> np.ndarray:
 
 
 class Builder:
-    """Collects bodies and primitives in any order and makes a `Scene` of them."""
+    """Collects bodies and primitives in any order and builds a `Scene` of them."""
 
     def __init__(self) -> None:
         self._paths, self._turns, self._stencils, self._parents = [path()], [turn()], [0.0], [0]

@@ -97,7 +97,7 @@ def jitter_of(number: int) -> np.ndarray:
             value += digit * (rest % base)
             rest //= base
         found.append(value - 0.5)
-    return np.float32(found)
+    return np.asarray(found, np.float32)
 
 
 def _arrays(value: R) -> R:

@@ -80,7 +80,7 @@ class Vector:
 
 
 def vector(value: Any) -> Vector:
-    """A `Vector` as it is; an array or a number as the vector whose coordinates are all that."""
+    """A `Vector` unchanged; an array or a number as the vector whose coordinates are all that."""
     return value if isinstance(value, Vector) else Vector(value, value, value)
 
 

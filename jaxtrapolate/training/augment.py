@@ -25,12 +25,12 @@ def flip(tree: T, *, horizontal: Flag, vertical: Flag) -> T:
     it becomes that one, view' = D view M and projection' = D projection D with D the mirror of the screen, M of the
     world; projecting the mirrored positions by it gives the mirrored pixels.
 
-    Mirroring at the plane of a camera instead leaves that camera as it is, but each frame has another, and that of a
+    Mirroring at the plane of a camera instead leaves that camera unchanged, but each frame has another, and that of a
     tilted one would tilt the mirrored world. Where z is up, a vertical flip turns the world upside down and leaves
     level what was level; where y is up, the picture is as valid, with a camera that is rolled by half a turn.
 
     Args:
-        tree: a `Frame`, a `Window`, or any pytree that holds such; what is not in a frame stays as it is.
+        tree: a `Frame`, a `Window`, or any pytree that holds such; what is not in a frame stays unchanged.
         horizontal: whether left and right are exchanged.
         vertical: whether top and bottom are.
     """
@@ -84,7 +84,7 @@ def crop(tree: T, key: PRNGKeyArray, *, size: Size, weight: Float[Array, "h w 1"
 
     Args:
         tree: images of one size.
-        key: of the place, which is uniform over all those inside the frame.
+        key: of the position, which is uniform over all those inside the frame.
         size: of the crop.
         weight: how likely a pixel is the one around which the crop is laid, anywhere in it and inside the frame; not
             negative. What has no weight is almost never chosen.

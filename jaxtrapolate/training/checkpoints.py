@@ -63,7 +63,7 @@ class Checkpoints:
             self._manager.save(step, args=ocp.args.StandardSave(state), metrics=scores)
 
     def restore(self, step: int, like: Any) -> Any:
-        """The state of a step, with the structure, types and places of the arrays `like`."""
+        """The state of a step, with the structure, types and shardings of the arrays `like`."""
         target = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
         return self._manager.restore(step, args=ocp.args.StandardRestore(target))
 
@@ -75,7 +75,7 @@ class Checkpoints:
 
 
 def model_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
-    """A network's weights and statistics as NumPy arrays, named by their places in it, as "down1/feature/kernel"."""
+    """A network's weights and statistics as NumPy arrays, named by their paths in it, as "down1/feature/kernel"."""
     _, state, _ = nnx.split(model, (nnx.Param, nnx.BatchStat), ...)
     pairs = nnx.to_flat_state(state)
     return {"/".join(map(str, path)): np.asarray(variable[...]) for path, variable in pairs}

@@ -6,7 +6,7 @@ A file holds the fields of `Config`; the table `[options]` those of the task's o
     steps = 100000
 
     [optimizer]
-    learning_rate = 1e-3
+    peak_learning_rate = 1e-3
 
     [options]
     crop = [128, 128]
@@ -32,7 +32,7 @@ class Optimizer:
     """Adam and the course of its learning rate: linear warm-up, constant, then half a cosine.
 
     Attributes:
-        learning_rate: at its height.
+        peak_learning_rate: between warm-up and decay.
         warmup: steps in which it rises linearly from 0.
         constant: steps at its height after that.
         decay: steps from there to the end of the cosine, which a run may stop short of; by default the rest of the run.
@@ -42,7 +42,7 @@ class Optimizer:
         clip: the gradient's largest norm, over all weights; not clipped where absent.
     """
 
-    learning_rate: float = 1e-3
+    peak_learning_rate: float = 1e-3
     warmup: int = 0
     constant: int = 0
     decay: int | None = None
@@ -54,7 +54,7 @@ class Optimizer:
     clip: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("learning_rate", "epsilon"):
+        for name in ("peak_learning_rate", "epsilon"):
             check_range(self, name, above=0)
         for name in ("warmup", "constant", "weight_decay"):
             check_range(self, name, least=0)
@@ -79,11 +79,11 @@ class Config:
         start: a file of weights, or a run's `model` folder, that the network begins with, or "default" for the weights
             that come with the package; at random where absent. The optimiser begins anew.
         batch: items a step, over all devices.
-        pool: examples that are made at a time, a multiple of `batch`.
+        pool: examples that are generated at a time, a multiple of `batch`.
         steps_per_round: steps between one pool and the next.
         optimizer: see `Optimizer`.
-        average: decay a step of the average of the weights that is validated and exported; the weights themselves where
-            absent.
+        ema_decay: of the exponential moving average of the weights, which is validated and exported; the weights
+            themselves where absent.
         precision: of the network while training; weights, averages and validation stay float32.
         log_every: steps from one line of the log to the next, the only times at which the host waits for the devices.
         checkpoint_every, validate_every: steps, multiples of `log_every`.
@@ -99,7 +99,7 @@ class Config:
     pool: int = 64
     steps_per_round: int = 64
     optimizer: Optimizer = dataclasses.field(default_factory=Optimizer)
-    average: float | None = None
+    ema_decay: float | None = None
     precision: Precision = "float32"
     log_every: int = 50
     checkpoint_every: int = 500
@@ -110,8 +110,8 @@ class Config:
         for name in ("steps", "batch", "pool", "steps_per_round", "log_every", "keep"):
             check_range(self, name, least=1)
         check_range(self, "seed", least=0, below=2**32)
-        if self.average is not None:
-            check_range(self, "average", least=0, below=1)
+        if self.ema_decay is not None:
+            check_range(self, "ema_decay", least=0, below=1)
         if self.pool % self.batch:
             raise ValueError(f"pool: expected a multiple of batch = {self.batch}, got {self.pool}")
         for name in ("checkpoint_every", "validate_every"):
@@ -154,8 +154,8 @@ def parse_config(table: Mapping[str, Any]) -> Config:
     options = table.get("options", {})
     if not isinstance(options, Mapping):
         raise ValueError(f"options: expected a table, got {options!r}")
-    made = parse(find_task(name).options, options, where="options")
-    return parse(Config, {**table, "options": made})
+    parsed = parse(find_task(name).options, options, where="options")
+    return parse(Config, {**table, "options": parsed})
 
 
 def load_config(name: str | os.PathLike[str], changes: Mapping[str, Any] | None = None) -> Config:

@@ -110,8 +110,8 @@ class ExtraNetTask:
             inputs["history"] = jnp.moveaxis(inputs["history"], 0, 2)  # [H, W, N, 4]: crops cut the leading axes
         example = inputs | {"target": target, "divisor": jnp.broadcast_to(divisor, color.shape).astype(target.dtype)}
         if self.options.crops == "error":
-            made, truth = self._measured(inputs["x"][..., :3], example)
-            example["weight"] = jnp.nan_to_num(jnp.mean(jnp.square(made - truth), -1, keepdims=True))
+            predicted, truth = self._measured(inputs["x"][..., :3], example)
+            example["weight"] = jnp.nan_to_num(jnp.mean(jnp.square(predicted - truth), -1, keepdims=True))
         return example
 
     def _measured(self, light: Array, example: Example) -> tuple[Array, Array]:
@@ -119,8 +119,8 @@ class ExtraNetTask:
         images = light, example["target"]
         if self.options.space == "log":
             return images
-        made, truth = (_display(image, example["divisor"]) for image in images)
-        return made, truth
+        predicted, truth = (_display(image, example["divisor"]) for image in images)
+        return predicted, truth
 
     def init(self, rngs: nnx.Rngs) -> nnx.Module:
         """A new network."""
@@ -142,19 +142,19 @@ class ExtraNetTask:
     def loss(self, model: nnx.Module, batch: Batch) -> tuple[Array, Mapping[str, Array]]:
         """The loss in the space that the options say, its mean over the batch."""
         o = self.options
-        made, truth = self._measured(_answer(model, batch), batch)
+        predicted, truth = self._measured(_predict(model, batch), batch)
         valid = _valid(batch["mask"], o.hole_margin)
         if o.loss == "relative":
             guess, _ = self._measured(batch["x"][..., :3], batch)
             holes = jnp.where(valid < 0.5, truth, jnp.nan)  # NaN does not count
             whole, hole = (
-                jnp.mean(jax.vmap(partial(relative_loss, epsilon=least))(made, target, guess))
+                jnp.mean(jax.vmap(partial(relative_loss, epsilon=least))(predicted, target, guess))
                 for target, least in ((truth, _LEAST_ERROR), (holes, _LEAST_HOLE_ERROR))
             )
             return whole + o.hole_weight * hole, {"whole": whole, "hole": hole}
         how: dict[str, Any] = {"hole_weight": o.hole_weight, "shade_weight": o.shade_weight}
         how |= {"shade": o.shade, "fraction": o.shade_fraction}
-        total, parts = jax.vmap(lambda *a: extranet_loss(*a, **how))(made, truth, valid.astype(jnp.float32))
+        total, parts = jax.vmap(lambda *a: extranet_loss(*a, **how))(predicted, truth, valid.astype(jnp.float32))
         return jnp.mean(total), {name: jnp.mean(part) for name, part in parts.items()}
 
     def validate(self, model: nnx.Module) -> tuple[Mapping[str, float], Mapping[str, Any]]:
@@ -171,7 +171,7 @@ def _valid(mask: Array, margin: int) -> Array:
     return -jax.lax.reduce_window(-mask, -jnp.inf, jax.lax.max, window, (1,) * mask.ndim, "SAME") if margin else mask
 
 
-def _answer(model: Any, batch: Batch) -> Array:
+def _predict(model: Any, batch: Batch) -> Array:
     history = jnp.moveaxis(batch["history"], 3, 1) if "history" in batch else None
     return model(batch["x"], batch["mask"], batch.get("features"), history)
 
@@ -191,18 +191,18 @@ def _display(light: Array, divisor: Array) -> Array:
 
 @nnx.jit
 def _scored(model: Any, one: Batch) -> tuple[dict[str, Array], Array]:
-    """The scores of one window, and the true image, the answer and the difference side by side."""
+    """The scores of one window, and the ground truth, the prediction and the difference side by side."""
     truth, divisor, hole = one["target"][0], one["divisor"][0], one["mask"][0] < 0.5
     known = jnp.isfinite(truth[..., :1])
-    images = {"psnr": _answer(model, one)[0], "guess": one["x"][0, ..., :3]}
+    images = {"psnr": _predict(model, one)[0], "guess": one["x"][0, ..., :3]}
     if one["x"].shape[-1] == 6:
         images["composite"] = one["x"][0, ..., 3:]
-    true, *made = (
+    truth, *predicted = (
         tonemap(jnp.where(known, log_decode(jnp.where(known, light, 0)) * divisor, 0))
         for light in (truth, *images.values())
     )
     scores = {}
-    for name, image in zip(images, made, strict=True):
-        scores[name] = psnr(image, true, mask=known)
-        scores[f"{name}_hole"] = psnr(image, true, mask=known & hole)
-    return scores, jnp.concatenate([true, made[0], jnp.minimum(4 * jnp.abs(made[0] - true), 1)], 1)
+    for name, image in zip(images, predicted, strict=True):
+        scores[name] = psnr(image, truth, mask=known)
+        scores[f"{name}_hole"] = psnr(image, truth, mask=known & hole)
+    return scores, jnp.concatenate([truth, predicted[0], jnp.minimum(4 * jnp.abs(predicted[0] - truth), 1)], 1)

@@ -49,7 +49,7 @@ class InterpolatorOptions:
 class InterpolatorTask:
     """Trains an `Interpolator` on what the method "interpolator" shows it, at the middle between two rendered frames.
 
-    An example holds "first" and "second", the network's inputs, and "target", the true frame as `compress` shows it.
+    An example holds "first" and "second", the network's inputs, and "target", the ground truth as `compress` shows it.
 
     References: Kong et al. 2022 (IFRNet), its reconstruction loss. Departures: without its census, flow distillation
     and feature losses; the flow is learned from colour alone.
@@ -95,9 +95,9 @@ class InterpolatorTask:
 
     def loss(self, model: nnx.Module, batch: Batch) -> tuple[Array, Mapping[str, Array]]:
         """`charbonnier_loss`, its mean over the batch."""
-        made = _answer(model, batch)
+        predicted = _predict(model, batch)
         return jnp.mean(
-            jax.vmap(lambda *a: charbonnier_loss(*a, epsilon=self.options.epsilon))(made, batch["target"])
+            jax.vmap(lambda *a: charbonnier_loss(*a, epsilon=self.options.epsilon))(predicted, batch["target"])
         ), {}
 
     def validate(self, model: nnx.Module) -> tuple[Mapping[str, float], Mapping[str, Any]]:
@@ -107,15 +107,15 @@ class InterpolatorTask:
         return validated(lambda one: _scored(model, one), self._held)
 
 
-def _answer(model: Any, batch: Batch) -> Array:
+def _predict(model: Any, batch: Batch) -> Array:
     first = batch["first"]
     return model(first, batch["second"], jnp.full(first.shape[0], 0.5, first.dtype))
 
 
 @nnx.jit
 def _scored(model: Any, one: Batch) -> tuple[dict[str, Array], Array]:
-    """The scores of one window, and the true image, the answer and the difference side by side."""
+    """The scores of one window, and the ground truth, the prediction and the difference side by side."""
     blend = (one["first"] + one["second"]) / 2
-    true, made, mean = (tonemap(expand(image[0])) for image in (one["target"], _answer(model, one), blend))
-    scores = {"psnr": psnr(made, true), "blend": psnr(mean, true)}
-    return scores, jnp.concatenate([true, made, jnp.minimum(4 * jnp.abs(made - true), 1)], 1)
+    truth, predicted, mean = (tonemap(expand(image[0])) for image in (one["target"], _predict(model, one), blend))
+    scores = {"psnr": psnr(predicted, truth), "blend": psnr(mean, truth)}
+    return scores, jnp.concatenate([truth, predicted, jnp.minimum(4 * jnp.abs(predicted - truth), 1)], 1)

@@ -52,7 +52,7 @@ class Journal:
                 write_png(folder / f"{step:08d}-{name}.png", codes.astype(np.uint8))
 
     def batch(self, step: int, batch: Any) -> Path:
-        """Writes the arrays of a batch, named by their places in it, as batch-<step>.npz."""
+        """Writes the arrays of a batch, named by their paths in it, as batch-<step>.npz."""
         path = self._workdir / f"batch-{step:08d}.npz"
         if self._active:
             leaves, _ = jax.tree_util.tree_flatten_with_path(batch)

@@ -49,12 +49,12 @@ def train_and_evaluate(
 
     Args:
         config: see `Config`.
-        workdir: a folder, made if need be. It holds one run.
+        workdir: a folder, created if need be. It holds one run.
         task: instead of the one that the configuration names.
         report: called at every line of the log.
         fresh: delete what an earlier run wrote to the workdir, and begin anew.
-        ahead: whether a thread makes the next round's pool while this one is trained on, which holds two in memory; by
-            default on accelerators only, for on a CPU both want the same cores.
+        ahead: whether a thread generates the next round's pool while this one is trained on, which holds two in memory;
+            by default on accelerators only, for on a CPU both want the same cores.
 
     Raises:
         InputError: a workdir of another configuration, of frames that have changed since, in use by another run, or
@@ -112,7 +112,7 @@ def _begun(state: State, start: str, task: Task) -> State:
 
 
 class _Pools:
-    """The pools by round; with `ahead`, a thread makes the next while this one is in use."""
+    """The pools by round; with `ahead`, a thread generates the next while this one is in use."""
 
     def __init__(self, task: Task, config: Config, *, ahead: bool) -> None:
         self._task, self._config = task, config
@@ -218,7 +218,7 @@ class _Run:
             self._report(text, done, self._config.steps)
 
     def _pool_times(self) -> dict[str, float]:
-        """Of the pools made since the last line; the time that was waited for them is forgotten."""
+        """Of the pools generated since the last line; the time that was waited for them is forgotten."""
         seconds, self._pools.seconds, self._pools.waited = self._pools.seconds, [], 0.0
         return {"pool_ms": 1e3 * sum(seconds) / len(seconds)} if seconds else {}
 

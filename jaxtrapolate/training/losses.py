@@ -5,7 +5,8 @@ holes. Sums are taken in at least float32.
 
 Non-finite values:
     A value of the target that is not finite counts nowhere, and has no gradient: there is nothing to learn from it. A
-    prediction that is not finite where the target is makes the loss NaN or infinite, so that a training run sees it.
+    prediction that is not finite where the target is gives a loss that is NaN or infinite, so that a training run sees
+    it.
 """
 
 from functools import partial

@@ -37,7 +37,7 @@ class State:
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """The functions of a run, made by `make_step`.
+    """The functions of a run, built by `make_step`.
 
     Attributes:
         create: `() -> State`, the initial one.
@@ -55,7 +55,7 @@ class Step:
 
 def schedule(optimizer: Optimizer, steps: int) -> optax.Schedule:
     """The learning rate by step, counted from 0."""
-    height, rise, level = optimizer.learning_rate, optimizer.warmup, optimizer.constant
+    height, rise, level = optimizer.peak_learning_rate, optimizer.warmup, optimizer.constant
     decay = optimizer.decay or max(1, steps - rise - level)
     fall = optax.cosine_decay_schedule(height, decay, alpha=optimizer.floor)
     rest = optax.join_schedules([optax.constant_schedule(height), fall], [level])
@@ -120,7 +120,7 @@ def make_step(task: Task, config: Config) -> Step:
 
     def create() -> State:
         _, weights, statistics, rest = split(True)
-        average = None if config.average is None else (weights, statistics)
+        average = None if config.ema_decay is None else (weights, statistics)
         return State(jnp.zeros((), jnp.int32), weights, statistics, rest, optimizer.init(weights), average)
 
     def cut(pool: Example, keys: Any) -> Batch:
@@ -156,10 +156,10 @@ def make_step(task: Task, config: Config) -> Step:
             weights = optax.apply_updates(state.weights, updates)
             used = {"gradient": optax.tree.norm(gradient), "learning_rate": rate(state.step)}
         average = state.average
-        if config.average is not None:
-            average = _averaged(config.average, state.step, average, (weights, statistics))
+        if config.ema_decay is not None:
+            average = _averaged(config.ema_decay, state.step, average, (weights, statistics))
         metrics |= {"loss": loss, **{name: jnp.asarray(value, jnp.float32) for name, value in used.items()}}
-        made = replace(
+        updated = replace(
             state,
             step=state.step + 1,
             weights=weights,
@@ -168,7 +168,7 @@ def make_step(task: Task, config: Config) -> Step:
             moments=moments,
             average=average,
         )
-        return made, metrics
+        return updated, metrics
 
     def model(state: State) -> nnx.Module:
         weights, statistics = state.average or (state.weights, state.statistics)

@@ -2,7 +2,7 @@
 
 The loop knows no network, no loss and no data. A task gives them as pure functions, so that a run is determined by its
 configuration: the pool of a round by (seed, round), the batch of a step by (seed, step). Resuming needs no state of the
-data; the round's pool is made once more.
+data; the round's pool is generated again.
 """
 
 import dataclasses
@@ -47,7 +47,7 @@ class Task(Protocol):
     def pool(self, key: PRNGKeyArray, numbers: range) -> Example:
         """The examples `numbers` of the pool that a key stands for, stacked along a leading axis, on local devices.
 
-        Example i depends on the key and on i alone: with several hosts each makes its own part.
+        Example i depends on the key and on i alone: with several hosts each generates its own part.
         """
         ...
 
@@ -73,7 +73,7 @@ class Task(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """A task by name: the frozen dataclass of its options, and how it is made of them."""
+    """A task by name: the frozen dataclass of its options, and how it is built from them."""
 
     options: type
     make: Callable[[Any], Task]

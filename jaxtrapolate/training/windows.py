@@ -1,4 +1,4 @@
-"""Examples: a frame to be made and what surrounds it, from the embedded scenes without end, or from dumps.
+"""Examples: a frame to be generated and what surrounds it, from the embedded scenes without end, or from dumps.
 
 An example is a `Window`, as evaluation hands it to methods: history of rendered frames with the buffers of the frames
 between them, the target without colour, the truth. A task runs its method's own stages on it, up to the network, once
@@ -18,9 +18,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxtrapolate.checks import Size, check_choice
 from jaxtrapolate.errors import InputError
-from jaxtrapolate.evaluation.windows import Window, hide
-from jaxtrapolate.evaluation.windows import windows as windows_of
-from jaxtrapolate.files import Sequence, open_sequence, runs
+from jaxtrapolate.evaluation.schedule import Slot
+from jaxtrapolate.evaluation.windows import Window, hide, load
+from jaxtrapolate.files import Sequence, around, open_sequence, runs
 from jaxtrapolate.records import Frame, GBuffer, replace
 from jaxtrapolate.scenes import TRAINING_SEEDS, Scene, render, scene, scene_names, stack_scenes
 from jaxtrapolate.training.augment import flip
@@ -41,12 +41,12 @@ MOVING = tuple(name for name in scene_names() if name != "still")
 _SHOWN = 4  # validation windows whose images are kept
 
 Prepare = Callable[[Window, PRNGKeyArray], Example]
-"""What a task makes of a window, once: pure and traced; for windows of several sizes cut to one."""
+"""What a task derives from a window, once: pure and traced; for windows of several sizes cut to one."""
 
 
 @dataclasses.dataclass(frozen=True)
 class WindowOptions:
-    """Which windows a pool is made of.
+    """Which windows a pool consists of.
 
     Attributes:
         size: `(H, W)` of frames of embedded scenes.
@@ -279,7 +279,7 @@ class Windows:
         return jax.tree.map(lambda *a: jnp.concatenate(a)[skipped : skipped + len(numbers)], *blocks)
 
     def _block(self, key: PRNGKeyArray, words: list[int], number: int, validation: bool) -> Example:
-        """The windows of one scene or dump that are made together."""
+        """The windows of one scene or dump that are prepared together."""
         options, count = self.options, self.options.together
         rng = np.random.default_rng([*words, number])
         flips = rng.random((2, count)) < np.array(options.flip)[:, None]
@@ -303,10 +303,18 @@ class Windows:
         times, steps = (rng.uniform(*bounds, count).astype(np.float32) for bounds in (options.time, options.step))
         return name, self._render(worlds, times, steps)
 
+    def _around(self, sequence: Sequence, number: int) -> Window:
+        """The window of any frame: of its neighbours every second one counts as rendered, from the next one on."""
+        before, behind = 2 * self._past - 1, max(0, 2 * self._future - 1)
+        group = around(sequence, number, before=before, behind=behind)
+        slot = Slot(number, group[:before], group[before + 1 :], rendered=False, first=False, full=True, distance=1)
+        ((_, window),) = load(sequence, [slot], hidden=group[1::2])
+        return window
+
     def _read(self, rng: np.random.Generator, count: int, validation: bool) -> tuple[str, Window]:
         dumps = [(sequence, held if validation else seen) for sequence, seen, held in self._dumps]
         shares = np.array([len(numbers) for _, numbers in dumps])
         sequence, numbers = dumps[rng.choice(len(dumps), p=shares / shares.sum())]
         chosen = [numbers[i] for i in rng.integers(0, len(numbers), count)]
-        read = [next(windows_of(sequence, [n], past=self._past, future=self._future)) for n in chosen]
+        read = [self._around(sequence, number) for number in chosen]
         return sequence.name, jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *read)

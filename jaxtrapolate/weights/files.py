@@ -41,7 +41,7 @@ class Weights:
     Attributes:
         method: the name that `jaxtrapolate.load` knows, `None` where the source does not say.
         config: what the method has to be built with, as in JSON; empty where the source does not say.
-        note: one line on how they were made.
+        note: one line on how they were trained.
         tree: nested dictionaries of arrays.
         source: the file, for messages.
     """
@@ -72,7 +72,7 @@ def save_weights(
         method: the name of the method.
         tree: a pytree of arrays of numbers; "path/of/param" are their names in the file.
         config: what the method has to be built with; goes through JSON.
-        note: one line on how they were made.
+        note: one line on how they were trained.
         name: the first part of the file's name, by default that of the method.
 
     Returns:

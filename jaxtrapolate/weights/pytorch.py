@@ -61,7 +61,7 @@ def read_torch(path: str | PathLike[str]) -> dict[str, Any]:
 
 
 class _Archive:
-    """The records of a checkpoint; each is stored as it is, so that all together are no more than the file."""
+    """The records of a checkpoint; each is stored unchanged, so that all together are no more than the file."""
 
     def __init__(self, file: BinaryIO):
         self.archive, self.storages, self.left = zipfile.ZipFile(file), {}, file.seek(0, 2)
@@ -153,6 +153,6 @@ def _parameter(tensor: Any, *_: Any) -> np.ndarray:
 
 
 def _build(value: Any, state: Any) -> None:
-    """The attributes of a state_dict, which say by which version of PyTorch each module was made, are left out."""
+    """The attributes of a state_dict, which say by which version of PyTorch each module was created, are left out."""
     if type(value) is not dict:
         raise ValueError(f"sets the state of a {type(value).__name__}: refused")

@@ -59,7 +59,7 @@ def hue(rng: Generator, *, saturation: float = 0.75, value: float = 0.7) -> np.n
 
 
 def offset(rng: Generator) -> np.ndarray:
-    """A random place in a solid texture, metres."""
+    """A random position in a solid texture, metres."""
     return rng.uniform(-20, 20, 3)
 
 
