@@ -95,7 +95,8 @@ def test_methods_that_other_packages_do_not_have(package, capsys, dump, tmp_path
     assert "cannot be imported" in capsys.readouterr().err
 
 
-def test_a_methods_stages_are_listed(capsys):
+def test_a_methods_stages_are_listed(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     assert main(["methods", "guided_warp"]) == 0
     out = " ".join(capsys.readouterr().out.split())
     for text in (
