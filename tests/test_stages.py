@@ -11,7 +11,7 @@ from synthetic import make_frame
 import jaxtrapolate as jx
 from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.methods import Method, Stage
-from jaxtrapolate.methods.method import rendered
+from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.records import Frame, replace
 

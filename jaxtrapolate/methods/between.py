@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.bidirectional.flows import complete_flows
-from jaxtrapolate.methods.method import Frames, Stage, Values, rendered, upcoming
+from jaxtrapolate.methods.frames import Frames, rendered, upcoming
+from jaxtrapolate.methods.method import Stage, Values
 from jaxtrapolate.methods.stages import chain
 from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Frame, Keyframe

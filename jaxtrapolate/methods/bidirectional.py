@@ -18,7 +18,8 @@ from jaxtrapolate.bidirectional.options import Choice, SearchOptions, Visibility
 from jaxtrapolate.bidirectional.search import FlowFilter, Solver
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.between import BETWEEN, CHAINED, FRAMES, PAIR, depth_of
-from jaxtrapolate.methods.method import Method, Stage, Values, rendered, upcoming
+from jaxtrapolate.methods.frames import rendered, upcoming
+from jaxtrapolate.methods.method import Method, Stage, Values
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.stages import SKY, Demodulation, chain, find_holes, reflecting
 from jaxtrapolate.methods.warping import GuidedSettings, fetch_guided, guides_of

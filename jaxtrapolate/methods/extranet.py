@@ -17,7 +17,8 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_choice
 from jaxtrapolate.errors import printable
-from jaxtrapolate.methods.method import Method, Stage, Values, rendered
+from jaxtrapolate.methods.frames import rendered
+from jaxtrapolate.methods.method import Method, Stage, Values
 from jaxtrapolate.methods.stages import (
     COMPOSITE,
     OCCLUSION,

@@ -13,7 +13,7 @@ is always there, or may be absent. An optional stage that takes what a stage giv
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, partial
-from itertools import groupby, pairwise
+from itertools import groupby
 from typing import Any, Literal, get_args
 
 import jax
@@ -22,14 +22,13 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_choice, missing_package
+from jaxtrapolate.methods.frames import Frames, buffer, cast, rendered, upcoming
 from jaxtrapolate.methods.options import Option, options_of, replaced
 from jaxtrapolate.ops.depth import surfaces
 from jaxtrapolate.ops.jitter import on_own_pixels
 from jaxtrapolate.records import Frame, check_frame, record
-from jaxtrapolate.records import replace as exchange
 
 Values = Mapping[str, Any]
-Frames = tuple[Frame, ...]
 
 Precision = Literal["float32", "bfloat16", "float16"]
 """What a method may work in, whatever its frames are in."""
@@ -104,87 +103,6 @@ def _named(names: Iterable[str]) -> str:
     return ", ".join(sorted(names)) or "nothing"
 
 
-def buffer(frame: Frame, name: str) -> Any:
-    """What a frame has by name, or `None`: one of its own fields, or a buffer of its `GBuffer`."""
-    if name in ("color", "motion", "camera", "jitter", "time", "objects"):
-        return getattr(frame, name)
-    return None if frame.gbuffer is None else getattr(frame.gbuffer, name)
-
-
-_KEPT = ("depth", "position", "stencil")
-
-
-def cast(frame: Frame, dtype: Any) -> Frame:
-    """A frame whose colour and buffers are of a dtype, but for depth, position and stencil, which need their digits."""
-    buffers, given = frame.gbuffer, None
-    if buffers is not None:
-        there = {f.name: getattr(buffers, f.name) for f in dataclasses.fields(buffers) if f.name not in _KEPT}
-        given = exchange(buffers, **{n: jnp.asarray(v, dtype) for n, v in there.items() if v is not None})
-    return exchange(frame, color=None if frame.color is None else jnp.asarray(frame.color, dtype), gbuffer=given)
-
-
-def rendered(history: Sequence[Frame]) -> list[int]:
-    """The places in a history of the frames with colour, newest first."""
-    return [i for i in range(len(history) - 1, -1, -1) if history[i].color is not None]
-
-
-def upcoming(future: Sequence[Frame]) -> list[int]:
-    """The places in a future of the frames with colour, the next first."""
-    return [i for i, frame in enumerate(future) if frame.color is not None]
-
-
-def neighbours(
-    colored: Sequence[bool],
-    place: int,
-    *,
-    past: int = 1,
-    future: int = 0,
-    numbers: Sequence[int | float] | None = None,
-) -> tuple[range, range]:
-    """Which frames of a sequence a method is to be handed as history and future, for the frame at `place`.
-
-    Back to the `past`-th rendered frame before it and on to the `future`-th after it, all frames between included, so
-    that motion chains through those without colour; what is beyond the last rendered frame is left out. Where `numbers`
-    step over frames nothing on the other side is taken: no motion leads across.
-
-    Args:
-        colored: of each frame whether it has colour.
-        place: of the frame to be made, an index into `colored`.
-        past, future: how many rendered frames, as the `Method` wants.
-        numbers: of the frames (or their times), ascending by one per frame; `None` where none is missing.
-
-    Returns:
-        Two ranges of indices: `history = [frames[i] for i in first]`. Empty where there is no rendered frame; shorter
-        where there are fewer.
-
-    Raises:
-        ValueError: `place` is no index, or numbers of another length or that do not ascend.
-    """
-    count = len(colored)
-    if not 0 <= place < count:
-        raise ValueError(f"place: expected 0 to {count - 1}, got {place}")
-    numbers = range(count) if numbers is None else numbers
-    if len(numbers) != count:
-        raise ValueError(f"numbers: expected {count} as there are frames, got {len(numbers)}")
-    steps = [later - earlier for earlier, later in pairwise(numbers)]
-    if any(step <= 0 for step in steps):
-        raise ValueError(f"numbers: expected each above the one before, got {list(numbers)}")
-
-    def last(places: range, wanted: int) -> int | None:
-        """The place of the `wanted`-th rendered frame, or of the last before a gap."""
-        found = None
-        for i in places:
-            step = steps[i] if i < place else steps[i - 1]
-            if wanted == 0 or step > 1:
-                break
-            if colored[i]:
-                found, wanted = i, wanted - 1
-        return found
-
-    first, final = last(range(place - 1, -1, -1), past), last(range(place + 1, count), future)
-    return range(place if first is None else first, place), range(place + 1, place + 1 if final is None else final + 1)
-
-
 def _run(stages: Sequence[Stage], state: Any, values: Values) -> dict[str, Any]:
     """What some stages add to the values, one after the other."""
     added: dict[str, Any] = {}
@@ -245,10 +163,8 @@ class Method:
         for stage in self.stages:
             members = sum(stage.group == other.group for other in self.stages)
             if stage.group is not None and (members < 2 or not stage.optional):
-                raise ValueError(
-                    f"method {self.name!r}, stage {stage.name!r}: expected group {stage.group!r} to have several "
-                    f"stages, all optional, got {members}, {'optional' if stage.optional else 'this one not optional'}"
-                )
+                where = f"method {self.name!r}, stage {stage.name!r}"
+                raise ValueError(f"{where}: expected group {stage.group!r} to have several stages, all optional")
         if self.scale != 1 and not self._for("rendered"):
             raise ValueError(f"method {self.name!r}: expected stages that super sample rendered frames too, got none")
         for kind in ("generated", "rendered"):

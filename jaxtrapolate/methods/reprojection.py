@@ -12,7 +12,8 @@ from jaxtrapolate.bidirectional.assisted import agree
 from jaxtrapolate.bidirectional.flows import camera_flow
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.between import depth_of
-from jaxtrapolate.methods.method import Frames, Method, Stage, Values, rendered
+from jaxtrapolate.methods.frames import Frames, rendered
+from jaxtrapolate.methods.method import Method, Stage, Values
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.stages import REPROJECT, SKY
 from jaxtrapolate.ops.depth import changed

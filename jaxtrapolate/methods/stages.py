@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.methods.method import Stage, Values, rendered
+from jaxtrapolate.methods.frames import rendered
+from jaxtrapolate.methods.method import Stage, Values
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.ops.holes import Taps, hole_masks
 from jaxtrapolate.ops.motion import chain_motion, occlusion_motion

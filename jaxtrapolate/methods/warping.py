@@ -4,8 +4,9 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.methods.hindsight import HINDSIGHT
-from jaxtrapolate.methods.method import Method, Stage, Values, rendered
+from jaxtrapolate.methods.method import Method, Stage, Values
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.stages import (
     COMPOSITE,
