@@ -365,7 +365,14 @@ def hosted(log):
     def third(state, values):
         return {"image": jnp.asarray(values["sum"])}
 
-    return Method("hosted", (Stage("first", first), Stage("second", second, host=True), Stage("third", third)))
+    return Method(
+        "hosted",
+        (
+            Stage("first", first, ("history",), ("double",)),
+            Stage("second", second, ("double",), ("sum",), host=True),
+            Stage("third", third, ("sum",), ("image",)),
+        ),
+    )
 
 
 def test_a_stage_on_the_host_is_never_traced():

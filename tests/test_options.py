@@ -97,7 +97,7 @@ def test_numbers_change_without_compiling_anew():
 
     def counted(state, values):
         traces.append(first.name)
-        return first.function(state, values)
+        return first(state, values)
 
     counting = dataclasses.replace(method, stages=(dataclasses.replace(first, function=counted), *rest))
     history, target, _ = window()
@@ -188,7 +188,9 @@ def test_what_is_cast():
         return {"image": values["history"][-1].color}
 
     history, target, truth = window()
-    method = jx.Method("look", (jx.Stage("look", look),), dtype="bfloat16")
+    method = jx.Method(
+        "look", (jx.Stage("look", look, ("carry", "history", "target", "future"), ("image",)),), dtype="bfloat16"
+    )
     np.testing.assert_array_equal(method((), replace(target, color=truth)), truth)  # rendered: as it is
     assert method(history, target).dtype == np.float32
     newest = seen["history"][-1]

@@ -42,7 +42,7 @@ def running_mean():
         new = jnp.concatenate([target.color, jnp.ones_like(target.color[..., :1])], -1)
         return {"carry": SHARE * new + (1 - SHARE) * carry, "image": jnp.asarray(target.color)}
 
-    stage = Stage("mean", advance, reads=("target.motion",), past=0, on="both")
+    stage = Stage("mean", advance, ("carry", "target"), ("carry", "image"), reads=("target.motion",), past=0, on="both")
     return Method("running_mean", (stage,), start=start)
 
 
@@ -125,7 +125,7 @@ def counting(name, calls):
         calls.append(float(values["target"].time))
         return {"image": values["history"][0].color}
 
-    return Method(name, (Stage("count", function, host=True),))
+    return Method(name, (Stage("count", function, ("history", "target"), ("image",), host=True),))
 
 
 def test_each_frame_is_generated_once_and_the_first_twice():
@@ -246,7 +246,12 @@ def test_exact_and_unknown_figures_survive_json(tmp_path):
 
     sequence = SyntheticSequence(range(4))
     results = jx.evaluate(
-        sequence, {"truth": Method("truth", (Stage("t", lambda s, v: {"image": v["history"][0].color}),))}
+        sequence,
+        {
+            "truth": Method(
+                "truth", (Stage("t", lambda s, v: {"image": v["history"][0].color}, ("history",), ("image",)),)
+            )
+        },
     )
     write_json(tmp_path / "r.json", results.to_json())
     assert Results.from_json(read_json(tmp_path / "r.json")).methods["truth"].psnr == results.methods["truth"].psnr

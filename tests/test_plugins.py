@@ -24,7 +24,7 @@ def brighter():
     def function(state, values):
         return {"image": 2 * jnp.asarray(values["history"][-1].color)}
 
-    return Method("brighter", (Stage("brighten", function, reads=("history.color",)),))
+    return Method("brighter", (Stage("brighten", function, ("history",), ("image",), reads=("history.color",)),))
 
 
 def nothing():
@@ -95,10 +95,18 @@ def test_methods_that_other_packages_do_not_have(package, capsys, dump, tmp_path
     assert "cannot be imported" in capsys.readouterr().err
 
 
-def test_a_methods_stages_are_listed(capsys):
+def test_a_methods_stages_are_listed(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     assert main(["methods", "guided_warp"]) == 0
     out = " ".join(capsys.readouterr().out.split())
-    for text in ("guided_warp: The demodulated frame fetched", "hindsight", "left out without", "target.motion"):
+    for text in (
+        "guided_warp: The demodulated frame fetched",
+        "hindsight",
+        "left out without",
+        "modulate",
+        "target.motion",
+        "plain_share?",
+    ):
         assert text in out
     assert main(["methods", "guided"]) == 2
     assert "no method 'guided'; there are repeat" in capsys.readouterr().err

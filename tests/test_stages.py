@@ -1,4 +1,6 @@
-"""Stages: the frames that they run on, and the carry of a method with memory."""
+"""Stages: the frames that they run on, the carry of a method with memory, what they take and give."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,7 @@ from synthetic import make_frame
 import jaxtrapolate as jx
 from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.methods import Method, Stage
-from jaxtrapolate.methods.method import rendered
+from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.records import Frame, replace
 
@@ -39,9 +41,9 @@ def running_mean():
         return jnp.asarray(frames[rendered(frames)[0]].color)
 
     stages = (
-        Stage("along", along, reads=("target.motion",), past=0, on="both"),
-        Stage("accumulate", accumulate, past=0, on="rendered"),
-        Stage("show", show, past=0),
+        Stage("along", along, ("carry", "target"), ("moved",), reads=("target.motion",), past=0, on="both"),
+        Stage("accumulate", accumulate, ("moved", "image"), ("carry", "image"), past=0, on="rendered"),
+        Stage("show", show, ("moved",), ("carry", "image"), past=0),
     )
     return Method("running_mean", stages, settings=MeanSettings(), start=start)
 
@@ -118,20 +120,146 @@ def test_a_method_without_stages_for_rendered_frames_returns_them():
 
 
 def test_a_stage_on_the_host_for_rendered_frames():
-    method = Method(
-        "hosted", (Stage("double", lambda state, values: {"image": 2 * values["image"]}, past=0, on="both", host=True),)
+    stage = Stage(
+        "double", lambda s, values: {"image": 2 * values["image"]}, ("image",), ("image",), past=0, on="rendered"
     )
+    method = Method("hosted", (dataclasses.replace(stage, host=True),))
     np.testing.assert_array_equal(method((), Frame(color=jnp.ones((2, 3, 3)))), np.full((2, 3, 3), 2))
 
 
 def test_super_sampling_needs_stages_for_rendered_frames():
-    stage = Stage(
-        "repeat",
-        lambda state, values: {"image": jnp.repeat(jnp.repeat(values["target"].color, 2, 0), 2, 1)},
-        past=0,
-        on="rendered",
-    )
+    def twice(state, values):
+        return {"image": jnp.repeat(jnp.repeat(values["target"].color, 2, 0), 2, 1)}
+
+    stage = Stage("repeat", twice, ("target",), ("image",), past=0)
     with pytest.raises(ValueError, match="method 'double': expected stages that super sample"):
-        Method("double", (Stage("repeat", stage.function),), scale=2)
-    method = Method("double", (stage,), scale=2)
+        Method("double", (stage,), scale=2)
+    method = Method("double", (dataclasses.replace(stage, on="rendered"),), scale=2)
     assert method((), Frame(color=jnp.ones((2, 3, 3)))).shape == (4, 6, 3)
+    frame = make_frame(0, SIZE)
+    with pytest.raises(ValueError, match="method 'double': generates no frames"):
+        method((frame,), hide(frame))
+
+
+# What stages take and give
+
+
+def stage(name, takes, gives, **options):
+    """One that gives images of ones."""
+    ones = dict.fromkeys(gives.split(), jnp.ones((*SIZE, 3)))
+    return Stage(name, lambda state, values: ones, tuple(takes.split()), tuple(gives.split()), **options)
+
+
+@pytest.mark.parametrize(
+    ("stages", "message"),
+    [
+        ([stage("a", "light", "image")], "stage 'a': takes 'light', which no stage gives before it"),
+        ([stage("a", "light", "image"), stage("b", "", "light")], "takes 'light', which no stage gives"),
+        (
+            [stage("a", "", "light", optional=True), stage("b", "light", "image")],
+            "stage 'b': takes 'light', which only opt",
+        ),
+        ([stage("a", "image", "image")], "stage 'a': takes 'image', which no stage gives"),
+        ([stage("a", "", "light")], "expected a stage that gives 'image'"),
+        ([stage("a", "", "image", optional=True)], "expected a stage that gives 'image' and is not optional"),
+        ([stage("a", "", "image"), stage("a", "", "light")], "expected stages with names of their own, got a, a"),
+        ([stage("a", "", "image", optional=True, group="g")], "stage 'a': expected group 'g' to have several"),
+        ([stage("a", "", "image", group="g"), stage("b", "", "image", group="g")], "all optional"),
+    ],
+)
+def test_methods_that_cannot_be_put_together(stages, message):
+    with pytest.raises(ValueError, match=f"method 'm'.*{message}"):
+        Method("m", tuple(stages))
+
+
+def test_a_stage_gives_what_it_says():
+    frame = make_frame(0, SIZE)
+    wrong = Stage("wrong", lambda state, values: {"picture": values["history"][0].color}, ("history",), ("image",))
+    with pytest.raises(ValueError, match="stage 'wrong': expected to give image, got picture"):
+        Method("m", (wrong,))((frame,), hide(frame))
+
+
+def test_a_stage_sees_what_it_takes():
+    seen = []
+
+    def look(state, values):
+        seen.append(dict(values))
+        return {"image": values["light"]}
+
+    frame = make_frame(0, SIZE)
+    method = Method("m", (stage("a", "", "light dark"), Stage("look", look, ("light", "sky?"), ("image",))))
+    method((frame,), hide(frame))
+    assert list(seen[0]) == ["light", "sky"]
+    assert seen[0]["sky"] is None
+
+
+def test_what_is_left_out_with_what():
+    """A stage without its buffer; what takes what it gives; and its group."""
+    history, target = (make_frame(0, SIZE),), hide(make_frame(1, SIZE))
+    stages = (
+        stage("a", "", "light", optional=True, reads=("target.shadow",)),
+        stage("b", "light", "lit", optional=True, group="g"),
+        stage("c", "", "dark", optional=True, group="g"),
+        stage("instead", "", "dark", fallback=True),
+        stage("d", "dark lit?", "image"),
+    )
+    method = Method("m", stages)
+    assert [s.name for s in method.active(history, target)] == ["instead", "d"]
+    assert method.missing(history, target) == {
+        "a": ["target.shadow"],
+        "b": ["light of stage 'a'"],
+        "c": ["stage 'b'"],
+    }
+    shadowed = replace(target, gbuffer=replace(target.gbuffer, shadow=target.gbuffer.depth))
+    assert [s.name for s in method.active(history, shadowed)] == ["a", "b", "c", "d"]
+    assert method.missing(history, shadowed) == {}
+    assert [s.name for s in method.without("a").stages] == ["instead", "d"]
+    assert [s.name for s in method.without("c").stages] == ["a", "instead", "d"]
+    with pytest.raises(ValueError, match="method 'm': expected one of its optional stages a, b, c, got 'd'"):
+        method.without("d")
+
+
+def test_a_fallback_that_is_needed_lacks_its_buffers():
+    history, target = (make_frame(0, SIZE),), hide(make_frame(1, SIZE))
+    stages = (
+        stage("a", "", "image", optional=True, reads=("target.depth",)),
+        stage("instead", "", "image", fallback=True, reads=("target.shadow",)),
+    )
+    method = Method("m", stages)
+    assert method.missing(history, target) == {}
+    flat = replace(target, gbuffer=replace(target.gbuffer, depth=None))
+    assert list(method.missing(history, flat)) == ["a", "instead"]
+    with pytest.raises(ValueError, match=r"stage 'instead': missing target\.shadow"):
+        method.active(history, flat)
+
+
+def lit(time):
+    """A frame in constant white light: its colour is its albedo."""
+    frame = make_frame(time, (32, 48))
+    none = np.zeros_like(frame.gbuffer.depth)
+    gbuffer = replace(frame.gbuffer, sky=none, sky_color=np.zeros_like(frame.color))
+    return replace(frame, color=frame.gbuffer.albedo, gbuffer=gbuffer)
+
+
+OPTIONAL = [(name, s.name) for name in jx.method_names() for s in jx.load(name).stages if s.optional]
+
+
+@pytest.mark.parametrize(
+    ("name", "left_out"), [pytest.param(*p, marks=pytest.mark.slow) if p[0] == "extranet" else p for p in OPTIONAL]
+)
+def test_any_optional_stage_may_be_left_out(name, left_out):
+    """Never is light shown that was not multiplied by the reflectance again: that would be white."""
+    whole = jx.load(name)
+    method = whole.without(left_out)
+    assert left_out not in [s.name for s in method.stages]
+    camera = jx.Camera(np.eye(4, dtype=np.float32), np.eye(4, dtype=np.float32))
+    cameras = left_out in ("linear motion", "camera motion", "change of depth")
+    frames = [replace(lit(time), camera=camera) if cameras else lit(time) for time in range(7)]
+    shown = [frame if time % 2 == 0 else hide(frame) for time, frame in enumerate(frames)]
+    target = replace(shown[5], gbuffer=replace(shown[5].gbuffer, sky_color=np.zeros_like(frames[5].color)))
+    given = tuple(shown[5 - (2 * method.past - 1) : 5]), target, tuple(shown[6 : 6 + 2 * method.future])
+    assert left_out in [s.name for s in whole.active(*given)]
+    image = method(*given)
+    assert np.isfinite(image).all()
+    if left_out != "linear motion":  # the cameras of these frames do not move
+        assert jx.psnr(image, frames[5].color) > 18

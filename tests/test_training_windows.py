@@ -326,7 +326,7 @@ class RefineTask:
         for stage in self.method.active(history, target):
             if stage.name == "warp":
                 break
-            values |= stage.function(self.method.state, values)
+            values |= stage(self.method.state, values)
         newest, motion, buffers = values["newest"], values["motion"], target.gbuffer
         warped = jx.backward_warp(jx.demodulate(newest.color, newest.gbuffer), motion)
         holes = jx.hole_masks(buffers, newest.gbuffer, motion, taps="nearest").any.astype(jnp.float32)

@@ -38,8 +38,15 @@ def twice():
         return {"image": image.repeat(2, 0).repeat(2, 1)}
 
     stages = (
-        Stage("twice", function, reads=("target.motion", "history.color"), on="generated"),
-        Stage("again", again, past=0, on="rendered"),
+        Stage(
+            "twice",
+            function,
+            ("history", "target"),
+            ("image",),
+            reads=("target.motion", "history.color"),
+            on="generated",
+        ),
+        Stage("again", again, ("target",), ("image",), past=0, on="rendered"),
     )
     return Method("twice", stages, scale=2)
 

@@ -17,7 +17,7 @@ from jaxtrapolate.evaluation.score import display
 from jaxtrapolate.evaluation.windows import arguments, held_back, windows
 from jaxtrapolate.files import SETTINGS_NAME, MotionConvention, Sequence, gaps, prefetch, runs
 from jaxtrapolate.methods import method_names
-from jaxtrapolate.methods.method import buffer
+from jaxtrapolate.methods.frames import buffer
 from jaxtrapolate.ops.ego_motion import camera_matrix, off_camera, static_ids
 from jaxtrapolate.ops.motion import convert_motion
 from jaxtrapolate.ops.warp import backward_warp

@@ -28,7 +28,8 @@ from jaxtrapolate.evaluation.windows import arguments, load
 from jaxtrapolate.files import Sequence, write_frame
 from jaxtrapolate.files.reader import stored_size
 from jaxtrapolate.methods import BEST_FIRST, method_names
-from jaxtrapolate.methods.method import Method, rendered
+from jaxtrapolate.methods.frames import rendered
+from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import written
 from jaxtrapolate.runtime.output import open_output, write_json
 from jaxtrapolate.weights import fingerprint

@@ -7,7 +7,7 @@ from rich.table import Table
 
 from jaxtrapolate.commands.inputs import terminal
 from jaxtrapolate.errors import InputError
-from jaxtrapolate.methods import Method, load, method_description, method_names
+from jaxtrapolate.methods import Method, Stage, load, method_description, method_names
 from jaxtrapolate.methods.options import written
 
 
@@ -53,15 +53,33 @@ def run(options: argparse.Namespace) -> None:
             again = "compiled anew" if option.static else ""
             table.add_row(option.name, written(option.default), option.allowed, again, option.doc)
         out.print(table)
-    table = Table(title="stages, in order")
-    for column in ("stage", "reads", "needed"):
+    table = Table(title="stages, in order: what each takes and gives")
+    for column in ("stage", "takes", "gives", "buffers", "runs"):
         table.add_column(column)
     for stage in method.stages:
         needs = [f"{stage.past} rendered frames in history"] if stage.past > 1 else []
         needs += [" or ".join(r.split("|")) for r in stage.reads]
         needs += [f'pip install "jaxtrapolate[{stage.extra}]"'] if stage.extra else []
-        table.add_row(stage.name, "; ".join(needs), "left out without" if stage.optional else "yes")
+        takes, gives = (", ".join(names) for names in (stage.takes, stage.gives))
+        table.add_row(stage.name, takes, gives, "; ".join(needs), _runs(stage, method.stages))
     out.print(table)
+    out.print('takes: "?" may be absent; "history", "target", "future" and "carry" are given at first', soft_wrap=True)
+
+
+def _runs(stage: Stage, stages: tuple[Stage, ...]) -> str:
+    """When a stage runs."""
+    said = [] if stage.on == "generated" else [{"rendered": "on rendered frames", "both": "on every frame"}[stage.on]]
+    if stage.fallback:
+        said.append(f"where no stage gave {', '.join(stage.gives)}")
+    if stage.optional:
+        before = stages[: stages.index(stage)]
+        givers = [[s for s in before if name in s.gives] for name in sorted(stage.needs)]
+        sole = [found[0].name for found in givers if found and all(s.optional for s in found)]
+        fellows = [s.name for s in stages if stage.group and s.group == stage.group and s is not stage]
+        others = list(dict.fromkeys([*sole, *fellows]))
+        why = (["its buffers"] if stage.reads or stage.past > 1 else []) + others
+        said.append(f"left out without {', '.join(why)}")
+    return "; ".join(said) or "always"
 
 
 def _loaded(name: str) -> tuple[Method | None, str]:

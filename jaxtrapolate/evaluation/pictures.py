@@ -12,7 +12,7 @@ from jaxtrapolate.checks import check_present
 from jaxtrapolate.evaluation.score import causes_of, display, truth_for
 from jaxtrapolate.evaluation.windows import Window
 from jaxtrapolate.files import Sequence, read_png, write_png
-from jaxtrapolate.methods.method import rendered
+from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.ops.holes import hole_masks
 from jaxtrapolate.records import CHANNELS, GBuffer
 from jaxtrapolate.report import colorize_causes, colorize_error

@@ -21,7 +21,8 @@ from jaxtrapolate.errors import InputError
 from jaxtrapolate.evaluation.schedule import Slot, needed_slots
 from jaxtrapolate.evaluation.windows import Window, arguments, load
 from jaxtrapolate.files import Sequence
-from jaxtrapolate.methods.method import Frames, Method, rendered
+from jaxtrapolate.methods.frames import Frames, rendered
+from jaxtrapolate.methods.method import Method
 from jaxtrapolate.records import Frame
 from jaxtrapolate.runtime.compiled import cache_hits
 

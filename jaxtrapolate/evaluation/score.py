@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.checks import ArrayLike, check_present
 from jaxtrapolate.evaluation.windows import Window
 from jaxtrapolate.files import Sequence, around
-from jaxtrapolate.methods.method import rendered
+from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.metrics import Metric, psnr
 from jaxtrapolate.metrics import load as load_metric
 from jaxtrapolate.ops.causes import CAUSES, cause_map, disoccluded

@@ -11,7 +11,8 @@ import jax
 
 from jaxtrapolate.evaluation.schedule import Slot, held_back_slots
 from jaxtrapolate.files import Sequence, prefetch
-from jaxtrapolate.methods.method import Frames, Method, rendered, upcoming
+from jaxtrapolate.methods.frames import Frames, rendered, upcoming
+from jaxtrapolate.methods.method import Method
 from jaxtrapolate.ops.forecast import forecast
 from jaxtrapolate.records import Frame, record, replace
 

@@ -17,10 +17,10 @@ from jaxtrapolate.methods import (
     reprojection,
     warping,
 )
+from jaxtrapolate.methods.frames import neighbours as neighbours
 from jaxtrapolate.methods.method import Method as Method
 from jaxtrapolate.methods.method import Precision as Precision
 from jaxtrapolate.methods.method import Stage as Stage
-from jaxtrapolate.methods.method import neighbours as neighbours
 from jaxtrapolate.weights import default_weights
 
 _METHODS: dict[str, Callable[[], Method]] = {

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.bidirectional.flows import complete_flows
-from jaxtrapolate.methods.method import Frames, Stage, Values, rendered, upcoming
+from jaxtrapolate.methods.frames import Frames, rendered, upcoming
+from jaxtrapolate.methods.method import Stage, Values
 from jaxtrapolate.methods.stages import chain
 from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Frame, Keyframe
@@ -40,7 +41,9 @@ def _pair(state, values: Values):
     }
 
 
-PAIR = Stage("pair", _pair, reads=("history.color", "future.color"))
+FRAMES = ("history", "target", "future")
+
+PAIR = Stage("pair", _pair, FRAMES, ("previous", "next", "alpha"), reads=("history.color", "future.color"))
 """Finds the rendered frames around the target, and its time between them."""
 
 
@@ -54,7 +57,7 @@ def _between(state, values: Values):
 CHAINED = ("future.motion", "before_next.motion", "since_newest.motion")
 """Where motion leads from the next rendered frame to the previous one; through the target where that has any."""
 
-BETWEEN = Stage("motion between", _between, reads=CHAINED)
+BETWEEN = Stage("motion between", _between, FRAMES, ("between",), reads=CHAINED)
 """Chains the motion from the next rendered frame to the previous one, through all that was drawn between them."""
 
 
@@ -70,5 +73,5 @@ def _flows(state, values: Values):
     return {"forward": flows.previous.forward_flow, "backward": values["between"]}
 
 
-FLOWS = Stage("flows", _flows, reads=CHAINED)
+FLOWS = Stage("flows", _flows, ("previous", "next", "between"), ("forward", "backward"), reads=CHAINED)
 """Both flows: the backward one is the chained motion, the forward one is made from it (`complete_flows`)."""

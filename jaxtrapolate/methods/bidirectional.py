@@ -17,8 +17,9 @@ from jaxtrapolate.bidirectional.interpolate import interpolate_bidirectional
 from jaxtrapolate.bidirectional.options import Choice, SearchOptions, VisibilityOptions, VisibilityTest
 from jaxtrapolate.bidirectional.search import FlowFilter, Solver
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.methods.between import BETWEEN, CHAINED, PAIR, depth_of
-from jaxtrapolate.methods.method import Method, Stage, Values, rendered, upcoming
+from jaxtrapolate.methods.between import BETWEEN, CHAINED, FRAMES, PAIR, depth_of
+from jaxtrapolate.methods.frames import rendered, upcoming
+from jaxtrapolate.methods.method import Method, Stage, Values
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.stages import SKY, Demodulation, chain, find_holes, reflecting
 from jaxtrapolate.methods.warping import GuidedSettings, fetch_guided, guides_of
@@ -64,8 +65,6 @@ def depth_kind(*frames: Frame) -> DepthKind:
 
 
 def _search(state, values: Values):
-    if "image" in values:  # made with the target's own buffers
-        return {}
     previous, next, between = (values[name] for name in ("previous", "next", "between"))
     kind = depth_kind(previous, next)
     flows = complete_flows(
@@ -90,8 +89,10 @@ def _search(state, values: Values):
     return {"image": jnp.where(made == first.color, jnp.asarray(previous.color), expand(made))}
 
 
-SEARCH = Stage("search", _search, reads=CHAINED)
+SEARCH = Stage("search", _search, ("previous", "next", "between", "alpha"), ("image",), reads=CHAINED, fallback=True)
 """Searches for each pixel's point in both frames, along their flows (5.1-5.3); what stands still stays bit for bit.
+
+Left out where the image was made with the target's own buffers.
 
 Departure: colours are fetched and blended after `compress`, not as linear light, see `mix`.
 """
@@ -134,16 +135,18 @@ def _reproject(state, values: Values):
     return {"to_previous": to_previous, "to_next": to_next, "seen": (seen_previous, seen_next)}
 
 
-REPROJECT_BOTH = Stage("reproject to both", _reproject, reads=("target.motion", *CHAINED, "target.depth"))
+REPROJECT_BOTH = Stage(
+    "reproject to both",
+    _reproject,
+    takes=(*FRAMES, "previous", "next"),
+    gives=("to_previous", "to_next", "seen"),
+    reads=("target.motion", *CHAINED, "target.depth"),
+)
 """The motion from the target to both rendered frames, and where its points are visible there.
 
 To the frame after it is that of the cameras where those are known and the surface is static, else the next frame's
 motion turned around (`complete_flows`). Visible is what no hole mask speaks against.
 """
-
-
-def _optional(stage: Stage) -> Stage:
-    return dataclasses.replace(stage, optional=True)
 
 
 def _layers(values: Values, how: Any) -> list[Array]:
@@ -179,8 +182,8 @@ def _weight(values: Values) -> Array:
     return jnp.where(in_first & in_second, values["alpha"], one.astype(values["alpha"].dtype))
 
 
-_BOTH = (*REPROJECT_BOTH.reads, "history.depth", "future.depth")
-"""What the blend of both frames by their depth takes."""
+_REPROJECTED = ("previous", "next", "target", "alpha", *REPROJECT_BOTH.gives)
+_FETCHED = ("fetched", "weight", "both")
 
 
 def _fetch(state, values: Values):
@@ -189,7 +192,7 @@ def _fetch(state, values: Values):
     return {"fetched": fetched, "weight": _weight(values), "both": values["seen"][0] & values["seen"][1]}
 
 
-FETCH = Stage("fetch", _fetch, reads=_BOTH, optional=True)
+FETCH = Stage("fetch", _fetch, _REPROJECTED, _FETCHED, reads=("target.depth", "history.depth", "future.depth"))
 """Fetches both frames along the motion, bilinearly."""
 
 
@@ -208,7 +211,9 @@ def _guided_fetch(state, values: Values):
     return {"fetched": tuple(fetched), "weight": weight, "both": inside[0] & inside[1]}
 
 
-GUIDED_FETCH = Stage("guided fetch", _guided_fetch, reads=(guides_of("history"), guides_of("future")))
+GUIDED_FETCH = Stage(
+    "guided fetch", _guided_fetch, _REPROJECTED, _FETCHED, reads=(guides_of("history"), guides_of("future"))
+)
 """Fetches both frames from the most similar pixels around where the motion leads, which need not be visible."""
 
 
@@ -217,7 +222,7 @@ def _blend(state, values: Values):
     return {"image": mix(first, second, values["weight"])}
 
 
-BLEND = Stage("blend", _blend)
+BLEND = Stage("blend", _blend, ("fetched", "weight"), ("image",))
 """Blends the colours of the two frames, see `mix`."""
 
 
@@ -236,43 +241,45 @@ def _apart(first: Array, second: Array, both: Array) -> Array:
     return _blocks(jnp.where(both, jnp.square(compress(first) - compress(second)), 0)) ** 2
 
 
-def relight_stage(*, reads: tuple[str, ...] = ()) -> Stage:
-    """Blends light instead of colour: over each frame's reflectance, times the target's.
+def _relight(state, values: Values):
+    (first, second), weight, both, how = values["fetched"], values["weight"], values["both"], state.settings
+    buffers = reflecting(values["target"].gbuffer, how.sky)
+    light = [modulate(layers[..., :3], buffers, by=how.by, floor=how.floor) for layers in (first, second)]
+    a, b = _apart(first[..., 3:], second[..., 3:], both), _apart(light[0], light[1], both)
+    a = a * jnp.square(jnp.asarray(how.margin, a.dtype))
+    relit = jnp.where(a + b > 0, a / jnp.where(a + b > 0, a + b, 1), 1)
+    height, width = both.shape[:2]
+    x, y = pixel_grid(height, width, relit.dtype)
+    x, y = (jnp.broadcast_to((v + 0.5) / _BLOCK - 0.5, (height, width)) for v in (x, y))
+    relit = sample(relit, x, y)
+    stands = jnp.all(first[..., 3:] == second[..., 3:], -1, keepdims=True)
+    for motion in (values["to_previous"], values["to_next"]):
+        stands &= jnp.all(motion == 0, -1, keepdims=True)
+    relit = jnp.where(stands, 0, relit)
+    return {"image": mix(values["image"], mix(light[0], light[1], weight), relit)}
 
-    Where light is not reflectance times irradiance (emission, fog) that prints a texture which is not there. There the
-    two frames agree better as they are: blocks of 8 x 8 pixels take the colour as it is by how much better it agrees,
-    and so do pixels that stand still.
 
-    Args:
-        reads: of the stages before it, where those are optional.
-    """
+RELIGHT = Stage(
+    "relight",
+    _relight,
+    takes=(*_FETCHED, "image", "target", "to_previous", "to_next"),
+    gives=("image",),
+    reads=("history.albedo", "target.albedo", "future.albedo"),
+    optional=True,
+)
+"""Blends light instead of colour: over each frame's reflectance, times the target's.
 
-    def function(state, values: Values):
-        (first, second), weight, both, how = values["fetched"], values["weight"], values["both"], state.settings
-        buffers = reflecting(values["target"].gbuffer, how.sky)
-        light = [modulate(layers[..., :3], buffers, by=how.by, floor=how.floor) for layers in (first, second)]
-        a, b = _apart(first[..., 3:], second[..., 3:], both), _apart(light[0], light[1], both)
-        a = a * jnp.square(jnp.asarray(how.margin, a.dtype))
-        relit = jnp.where(a + b > 0, a / jnp.where(a + b > 0, a + b, 1), 1)
-        height, width = both.shape[:2]
-        x, y = pixel_grid(height, width, relit.dtype)
-        x, y = (jnp.broadcast_to((v + 0.5) / _BLOCK - 0.5, (height, width)) for v in (x, y))
-        relit = sample(relit, x, y)
-        stands = jnp.all(first[..., 3:] == second[..., 3:], -1, keepdims=True)
-        for motion in (values["to_previous"], values["to_next"]):
-            stands &= jnp.all(motion == 0, -1, keepdims=True)
-        relit = jnp.where(stands, 0, relit)
-        return {"image": mix(values["image"], mix(light[0], light[1], weight), relit)}
-
-    reads = (*reads, "history.albedo", "target.albedo", "future.albedo")
-    return Stage("relight", function, reads=reads, optional=True)
+Where light is not reflectance times irradiance (emission, fog) that prints a texture which is not there. There the two
+frames agree better as they are: blocks of 8 x 8 pixels take the colour as it is by how much better it agrees, and so do
+pixels that stand still.
+"""
 
 
 def bidirectional() -> Method:
     """Both rendered frames around the target, by the target's own motion and buffers where those were drawn."""
-    blend = dataclasses.replace(BLEND, reads=_BOTH, optional=True)
-    both = (_optional(REPROJECT_BOTH), FETCH, blend, relight_stage(reads=_BOTH))
-    stages = (PAIR, BETWEEN, *both, SEARCH, SKY)
+    assisted = (REPROJECT_BOTH, FETCH, BLEND)
+    assisted = (dataclasses.replace(stage, optional=True, group="target") for stage in assisted)
+    stages = (PAIR, BETWEEN, *assisted, RELIGHT, SEARCH, SKY)
     return Method("bidirectional", stages, kind="interpolation", future=1, settings=AssistedSettings())
 
 
@@ -288,5 +295,5 @@ def bidirectional_guided() -> Method:
     Ours. The guided warp finds like surfaces beside a hole, so that a frame in which the point is hidden still says
     something of its light.
     """
-    stages = (PAIR, BETWEEN, REPROJECT_BOTH, GUIDED_FETCH, BLEND, relight_stage(), SKY)
+    stages = (PAIR, BETWEEN, REPROJECT_BOTH, GUIDED_FETCH, BLEND, RELIGHT, SKY)
     return Method("bidirectional_guided", stages, kind="interpolation", future=1, settings=GuidedSettings())

@@ -36,7 +36,12 @@ def blend() -> Method:
         previous, next = values["previous"].color, values["next"].color
         return {"image": mix(previous, next, evenly(values["alpha"], previous))}
 
-    return Method("blend", (PAIR, Stage("blend", function)), kind="interpolation", future=1)
+    return Method(
+        "blend",
+        (PAIR, Stage("blend", function, ("previous", "next", "alpha"), ("image",))),
+        kind="interpolation",
+        future=1,
+    )
 
 
 def half_motion() -> Method:
@@ -51,7 +56,12 @@ def half_motion() -> Method:
         between = values["between"]
         return {"image": backward_warp(values["previous"].color, values["alpha"].astype(between.dtype) * between)}
 
-    return Method("half_motion", (PAIR, BETWEEN, Stage("fetch", function)), kind="interpolation", future=1)
+    return Method(
+        "half_motion",
+        (PAIR, BETWEEN, Stage("fetch", function, ("previous", "between", "alpha"), ("image",))),
+        kind="interpolation",
+        future=1,
+    )
 
 
 def _nearness(depth: Array, scale: float | Array) -> Float[Array, "h w 1"]:
@@ -115,5 +125,13 @@ def softmax_splat() -> Method:
     def fill(state, values: Values):
         return {"image": fill_pyramid(values["mixed"], values["covered"])}
 
-    stages = (PAIR, BETWEEN, FLOWS, Stage("exponents", importance), Stage("splat", function), Stage("fill", fill))
+    moving = ("previous", "next", "forward", "backward")
+    stages = (
+        PAIR,
+        BETWEEN,
+        FLOWS,
+        Stage("exponents", importance, moving, ("exponents",)),
+        Stage("splat", function, (*moving, "alpha", "exponents"), ("mixed", "covered")),
+        Stage("fill", fill, ("mixed", "covered"), ("image",)),
+    )
     return Method("softmax_splat", stages, kind="interpolation", future=1, settings=SoftmaxSettings())

@@ -17,14 +17,15 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_choice
 from jaxtrapolate.errors import printable
-from jaxtrapolate.methods.method import Method, Stage, Values, rendered
+from jaxtrapolate.methods.frames import rendered
+from jaxtrapolate.methods.method import Method, Stage, Values
 from jaxtrapolate.methods.stages import (
+    COMPOSITE,
     OCCLUSION,
     SKY,
     composite,
     demodulate_stage,
     holes_stage,
-    layers,
     modulate_stage,
     reflecting,
     reproject_stage,
@@ -174,7 +175,7 @@ def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
         warped = [encode(image) for image in values["histories"]]
         first = encode(values["warped"])
         valid = [1 - mask.astype(first.dtype) for mask in values["masks"]]
-        guesses = [first, encode(composite(values, layers(values)[0], outside=preparation.outside))]
+        guesses = [first, encode(composite(values, values["layers"][0], outside=preparation.outside))]
         sources = [jnp.concatenate(pair, -1) for pair in zip(warped, valid, strict=True)]
         sources = [sources[min(k, len(sources) - 1)] for k in range(config.histories)]
         inputs = {
@@ -185,7 +186,7 @@ def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
         }
         return {"inputs": inputs}
 
-    return Stage("inputs", function)
+    return Stage("inputs", function, ("target", "layers", "masks", "histories", "warped", *COMPOSITE), ("inputs",))
 
 
 def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Method:
@@ -220,7 +221,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
     guided = (dataclasses.replace(GUIDED, optional=True),) if preparation.first_guess == "guided" else ()
 
     def warp(state, values: Values):
-        pairs = zip(layers(values), values["motions"], strict=True)
+        pairs = zip(values["layers"], values["motions"], strict=True)
         warped = tuple(backward_warp(image, motion, outside=preparation.outside) for image, motion in pairs)
         return {"histories": warped, "warped": warped[0]}
 
@@ -247,12 +248,24 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
         dataclasses.replace(OCCLUSION, optional=True),
         holes_stage(preparation.taps, position_threshold=preparation.position_threshold),
         demodulate_stage(preparation),
-        Stage("warp", warp),
+        Stage("warp", warp, ("layers", "motions"), ("histories", "warped")),
         *guided,
         _inputs_stage(config, preparation),
-        Stage("network", network),
+        Stage(
+            "network",
+            network,
+            takes=("inputs", "history", "motions", "histories", "warped"),
+            gives=("warped", "image", "guess"),
+        ),
         modulate_stage(preparation),
-        Stage("warped sky", sky, reads=("target.sky",), optional=True),
+        Stage(
+            "warped sky",
+            sky,
+            takes=("image", "guess", "newest", "target", *COMPOSITE),
+            gives=("image",),
+            reads=("target.sky",),
+            optional=True,
+        ),
         SKY,
     )
     given = Guide() if guided else ()

@@ -6,7 +6,7 @@ The papers' warps go forward from one frame; see `jaxtrapolate.ops.grid.grid_war
 from jaxtrapolate.methods.between import BETWEEN, FLOWS, PAIR, depth_of
 from jaxtrapolate.methods.method import Method, Stage, Values
 from jaxtrapolate.methods.options import option, settings
-from jaxtrapolate.methods.reprojection import CAMERA, LINEAR, NEWEST, ONWARD_NEEDS, carried_depth
+from jaxtrapolate.methods.reprojection import CAMERA, LINEAR, NEWEST, ONWARD, carried_depth
 from jaxtrapolate.ops.fill import fill_pyramid
 from jaxtrapolate.ops.grid import grid_warp as warp_grid
 
@@ -23,7 +23,7 @@ def _fill(state, values: Values):
     return {"image": fill_pyramid(values["warped"], values["covered"])}
 
 
-_FILL = Stage("fill", _fill)
+_FILL = Stage("fill", _fill, ("warped", "covered"), ("image",))
 
 
 def grid_warp() -> Method:
@@ -41,7 +41,8 @@ def grid_warp() -> Method:
         warped, covered = warp_grid(previous.color, *moved, cell=state.settings.cell, tear=state.settings.tear)
         return {"warped": warped, "covered": covered}
 
-    stages = (PAIR, BETWEEN, FLOWS, Stage("grid warp", function), _FILL)
+    warp = Stage("grid warp", function, ("previous", "forward", "alpha"), ("warped", "covered"))
+    stages = (PAIR, BETWEEN, FLOWS, warp, _FILL)
     return Method("grid_warp", stages, kind="interpolation", future=1, settings=GridSettings())
 
 
@@ -58,5 +59,6 @@ def grid_extrapolate() -> Method:
         )
         return {"warped": warped, "covered": covered}
 
-    stages = (NEWEST, LINEAR, CAMERA, Stage("grid warp", function, reads=ONWARD_NEEDS), _FILL)
+    warp = Stage("grid warp", function, ("newest", "onward", "deeper"), ("warped", "covered"))
+    stages = (NEWEST, LINEAR, CAMERA, ONWARD, warp, _FILL)
     return Method("grid_extrapolate", stages, settings=GridSettings())

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.methods.method import Stage, Values, rendered
+from jaxtrapolate.methods.frames import rendered
+from jaxtrapolate.methods.method import Stage, Values
 from jaxtrapolate.methods.stages import chain, reflecting
 from jaxtrapolate.ops.radiance import By, compress, demodulate, modulate
 from jaxtrapolate.ops.warp import backward_warp, landing, sample
@@ -85,6 +86,8 @@ def _hindsight(state, values: Values):
 HINDSIGHT = Stage(
     "hindsight",
     _hindsight,
+    takes=("history", "motion"),
+    gives=("plain_share",),
     reads=("history.albedo", "target.albedo", "newest.motion", "before_newest.motion"),
     optional=True,
     past=2,

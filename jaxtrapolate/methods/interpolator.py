@@ -37,7 +37,11 @@ def interpolator(model: Interpolator) -> Method:
     def network(state, values: Values):
         return {"image": expand(function(state.weights, *values["inputs"]))}
 
-    stages = (PAIR, Stage("inputs", inputs), Stage("network", network))
+    stages = (
+        PAIR,
+        Stage("inputs", inputs, ("previous", "next", "alpha"), ("inputs",)),
+        Stage("network", network, ("inputs",), ("image",)),
+    )
     return Method(_NAME, stages, kind="interpolation", future=1, weights=weights, networks={"network": function})
 
 

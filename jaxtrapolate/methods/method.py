@@ -1,16 +1,19 @@
 """What a method is: a list of named stages over one set of values.
 
 The run, the benchmark, the plan and the reports all read that one list. A stage is a pure function of the method's
-state (its weights and options) and of the values so far, a dict; it returns the values that it adds. A method starts
+state (its weights and options) and of the values that it takes, a dict; it returns those that it gives. A method starts
 with "carry", "history", "target" and "future", frames whose depth is +inf where no surface was hit, and ends with
-"image". A target with colour is a rendered frame: its stages start with that as "image". A stage with memory returns a
+"image". A target with colour is a rendered frame: its stages start with that as "image". A stage with memory gives a
 new "carry". A stage on the host (a library that is not JAX) is run between the compiled ones around it.
+
+What is given by name to whom is checked when a method is put together: what is taken is given before, by a stage that
+is always there, or may be absent. An optional stage that takes what a stage gives that is left out is left out with it.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, partial
-from itertools import groupby, pairwise
+from itertools import groupby
 from typing import Any, Literal, get_args
 
 import jax
@@ -19,14 +22,13 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_choice, missing_package
+from jaxtrapolate.methods.frames import Frames, buffer, cast, rendered, upcoming
 from jaxtrapolate.methods.options import Option, options_of, replaced
 from jaxtrapolate.ops.depth import surfaces
 from jaxtrapolate.ops.jitter import on_own_pixels
 from jaxtrapolate.records import Frame, check_frame, record
-from jaxtrapolate.records import replace as exchange
 
 Values = Mapping[str, Any]
-Frames = tuple[Frame, ...]
 
 Precision = Literal["float32", "bfloat16", "float16"]
 """What a method may work in, whatever its frames are in."""
@@ -47,7 +49,9 @@ class Stage:
 
     Attributes:
         name: what reports call it.
-        function: `(state, values) -> values to add`.
+        function: `(state, values) -> values`: from those that it takes to those that it gives.
+        takes: the names of values; those that end in "?" are `None` where no stage before it gave them.
+        gives: the names of the values that it returns, all of them; they replace what stages before it gave.
         reads: the buffers that it needs, as "target.depth"; "target+newest.normal" is needed in both, and alternatives
             are separated by "|". Frames are named "target"; "history" and "future", every rendered frame that the
             method takes; "newest", the newest of history; and what was not rendered, every frame if there is any, which
@@ -55,6 +59,8 @@ class Stage:
             that and the rendered one before it, and "before_next", in future before the next rendered frame.
         optional: whether the method does without it: left out where a buffer is missing. Without a stage that is not
             optional the method cannot run.
+        group: of optional stages that make sense together alone: if one is left out all of that name are.
+        fallback: whether it only runs where what it gives was not given by stages before it.
         past: how many rendered frames it needs in history; 0 where its target or the carry is enough.
         on: the targets that it runs on: those that are generated (without colour), the rendered ones, or both.
         host: whether its function is no JAX code: it gets arrays and is never traced.
@@ -63,100 +69,45 @@ class Stage:
 
     name: str
     function: Callable[[Any, Values], dict[str, Any]]
+    takes: tuple[str, ...]
+    gives: tuple[str, ...]
     reads: tuple[str, ...] = ()
     optional: bool = False
+    group: str | None = None
+    fallback: bool = False
     past: int = 1
     on: Literal["generated", "rendered", "both"] = "generated"
     host: bool = False
     extra: str | None = None
 
+    @property
+    def needs(self) -> frozenset[str]:
+        """The values that it cannot do without."""
+        return frozenset(name for name in self.takes if not name.endswith("?"))
 
-def buffer(frame: Frame, name: str) -> Any:
-    """What a frame has by name, or `None`: one of its own fields, or a buffer of its `GBuffer`."""
-    if name in ("color", "motion", "camera", "jitter", "time", "objects"):
-        return getattr(frame, name)
-    return None if frame.gbuffer is None else getattr(frame.gbuffer, name)
+    def __call__(self, state: Any, values: Values) -> dict[str, Any]:
+        """What it gives, from values among which are those that it takes.
 
-
-_KEPT = ("depth", "position", "stencil")
-
-
-def cast(frame: Frame, dtype: Any) -> Frame:
-    """A frame whose colour and buffers are of a dtype, but for depth, position and stencil, which need their digits."""
-    buffers, given = frame.gbuffer, None
-    if buffers is not None:
-        there = {f.name: getattr(buffers, f.name) for f in dataclasses.fields(buffers) if f.name not in _KEPT}
-        given = exchange(buffers, **{n: jnp.asarray(v, dtype) for n, v in there.items() if v is not None})
-    return exchange(frame, color=None if frame.color is None else jnp.asarray(frame.color, dtype), gbuffer=given)
-
-
-def rendered(history: Sequence[Frame]) -> list[int]:
-    """The places in a history of the frames with colour, newest first."""
-    return [i for i in range(len(history) - 1, -1, -1) if history[i].color is not None]
+        Raises:
+            ValueError: its function returned others than it gives.
+        """
+        taken = {name: values[name] for name in self.needs}
+        taken |= {name[:-1]: values.get(name[:-1]) for name in self.takes if name.endswith("?")}
+        given = self.function(state, taken)
+        if set(given) != set(self.gives):
+            raise ValueError(f"stage {self.name!r}: expected to give {_named(self.gives)}, got {_named(given)}")
+        return given
 
 
-def upcoming(future: Sequence[Frame]) -> list[int]:
-    """The places in a future of the frames with colour, the next first."""
-    return [i for i, frame in enumerate(future) if frame.color is not None]
-
-
-def neighbours(
-    colored: Sequence[bool],
-    place: int,
-    *,
-    past: int = 1,
-    future: int = 0,
-    numbers: Sequence[int | float] | None = None,
-) -> tuple[range, range]:
-    """Which frames of a sequence a method is to be handed as history and future, for the frame at `place`.
-
-    Back to the `past`-th rendered frame before it and on to the `future`-th after it, all frames between included, so
-    that motion chains through those without colour; what is beyond the last rendered frame is left out. Where `numbers`
-    step over frames nothing on the other side is taken: no motion leads across.
-
-    Args:
-        colored: of each frame whether it has colour.
-        place: of the frame to be made, an index into `colored`.
-        past, future: how many rendered frames, as the `Method` wants.
-        numbers: of the frames (or their times), ascending by one per frame; `None` where none is missing.
-
-    Returns:
-        Two ranges of indices: `history = [frames[i] for i in first]`. Empty where there is no rendered frame; shorter
-        where there are fewer.
-
-    Raises:
-        ValueError: `place` is no index, or numbers of another length or that do not ascend.
-    """
-    count = len(colored)
-    if not 0 <= place < count:
-        raise ValueError(f"place: expected 0 to {count - 1}, got {place}")
-    numbers = range(count) if numbers is None else numbers
-    if len(numbers) != count:
-        raise ValueError(f"numbers: expected {count} as there are frames, got {len(numbers)}")
-    steps = [later - earlier for earlier, later in pairwise(numbers)]
-    if any(step <= 0 for step in steps):
-        raise ValueError(f"numbers: expected each above the one before, got {list(numbers)}")
-
-    def last(places: range, wanted: int) -> int | None:
-        """The place of the `wanted`-th rendered frame, or of the last before a gap."""
-        found = None
-        for i in places:
-            step = steps[i] if i < place else steps[i - 1]
-            if wanted == 0 or step > 1:
-                break
-            if colored[i]:
-                found, wanted = i, wanted - 1
-        return found
-
-    first, final = last(range(place - 1, -1, -1), past), last(range(place + 1, count), future)
-    return range(place if first is None else first, place), range(place + 1, place + 1 if final is None else final + 1)
+def _named(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names)) or "nothing"
 
 
 def _run(stages: Sequence[Stage], state: Any, values: Values) -> dict[str, Any]:
     """What some stages add to the values, one after the other."""
     added: dict[str, Any] = {}
     for stage in stages:
-        added |= stage.function(state, {**values, **added})
+        added |= stage(state, {**values, **added})
     return added
 
 
@@ -206,8 +157,43 @@ class Method:
     def __post_init__(self):
         if self.dtype is not None:
             check_choice("dtype", self.dtype, get_args(Precision))
-        if self.scale != 1 and not any(stage.on != "generated" for stage in self.stages):
+        names = [stage.name for stage in self.stages]
+        if len(set(names)) < len(names):
+            raise ValueError(f"method {self.name!r}: expected stages with names of their own, got {', '.join(names)}")
+        for stage in self.stages:
+            members = sum(stage.group == other.group for other in self.stages)
+            if stage.group is not None and (members < 2 or not stage.optional):
+                where = f"method {self.name!r}, stage {stage.name!r}"
+                raise ValueError(f"{where}: expected group {stage.group!r} to have several stages, all optional")
+        if self.scale != 1 and not self._for("rendered"):
             raise ValueError(f"method {self.name!r}: expected stages that super sample rendered frames too, got none")
+        for kind in ("generated", "rendered"):
+            if stages := self._for(kind):
+                self._check_values(stages, self._begin(kind))
+
+    def _check_values(self, stages: Sequence[Stage], begin: set[str]) -> None:
+        """Raise unless every value that a stage needs is given before it, to the end also the image."""
+        certain, possible = set(begin), set(begin)
+        for stage in stages:
+            for value in sorted(stage.needs - (possible if stage.optional else certain)):
+                which = "only optional stages give" if value in possible else "no stage gives"
+                raise ValueError(
+                    f"method {self.name!r}, stage {stage.name!r}: takes {value!r}, which {which} before it"
+                )
+            possible |= set(stage.gives)
+            if not stage.optional:
+                certain |= set(stage.gives)
+        if "image" not in certain:
+            raise ValueError(f"method {self.name!r}: expected a stage that gives 'image' and is not optional, got none")
+
+    def _for(self, kind: str) -> tuple[Stage, ...]:
+        """The stages for targets of a kind, "generated" or "rendered"."""
+        return tuple(stage for stage in self.stages if stage.on in (kind, "both"))
+
+    def _begin(self, kind: str) -> set[str]:
+        """The names of what the first stage gets."""
+        names = {"carry", "history", "target", "future"}
+        return names | {"image"} if kind == "rendered" and self.scale == 1 else names
 
     @property
     def state(self) -> State:
@@ -235,14 +221,62 @@ class Method:
         """Whether it has a carry, so that it is to be given every frame in order of display, the rendered ones too."""
         return self.start is not None
 
-    def _on(self, target: Frame) -> tuple[Stage, ...]:
-        """The stages for a target as it is, rendered or to be generated."""
-        kind = "generated" if target.color is None else "rendered"
-        return tuple(stage for stage in self.stages if stage.on in (kind, "both"))
+    def without(self, *names: str) -> "Method":
+        """This method without some optional stages, those of their groups, and those that take what they give.
+
+        Raises:
+            ValueError: no stage of that name, or one that is not optional.
+        """
+        optional = {stage.name: stage for stage in self.stages if stage.optional}
+        for name in names:
+            if name not in optional:
+                raise ValueError(
+                    f"method {self.name!r}: expected one of its optional stages {_named(optional)}, got {name!r}"
+                )
+        gone = set(names)
+        while True:
+            groups = {optional[name].group for name in gone} - {None}
+            rest = [stage for stage in self.stages if stage.name not in gone and stage.group not in groups]
+            given = {name for stage in rest for name in stage.gives} | self._begin("rendered")
+            gone = {stage.name for stage in self.stages if stage not in rest}
+            if not (more := {stage.name for stage in rest if stage.optional and not stage.needs <= given}):
+                return dataclasses.replace(self, stages=tuple(rest))
+            gone |= more
 
     def missing(self, history: Frames, target: Frame, future: Frames = ()) -> dict[str, list[str]]:
-        """What each stage that cannot run lacks: `{stage: [buffers]}`; of all for such a target, optional or not."""
-        return {s.name: lacks for s in self._on(target) if (lacks := self._lacks(s, history, target, future))}
+        """What each stage that cannot run lacks: `{stage: [buffers]}`; of all for such a target, optional or not.
+
+        Of one that lacks no buffer, the stage without which it is left out.
+        """
+        return self._chosen(history, target, future)[1]
+
+    def _chosen(self, history: Frames, target: Frame, future: Frames) -> tuple[list[Stage], dict[str, list[str]]]:
+        """The stages that can run on frames like these, and what those lack that cannot."""
+        kind = "generated" if target.color is None else "rendered"
+        stages = self._for(kind)
+        lacks = {s.name: lacks for s in stages if (lacks := self._lacks(s, history, target, future))}
+        while True:
+            given, absent = self._begin(kind), {}  # the names of values; of stages left out those that give the others
+            chosen, unneeded, more = [], set(), {}
+            for stage in stages:
+                lost = sorted(stage.needs - given)
+                if stage.fallback and given >= set(stage.gives):
+                    unneeded.add(stage.name)
+                elif not stage.optional or not (lost or stage.name in lacks):
+                    given |= set(stage.gives)  # without one that is not optional the method does not run at all
+                    chosen.append(stage)
+                else:
+                    absent |= dict.fromkeys(stage.gives, stage.name)
+                    more |= {stage.name: [f"{value} of stage {absent[value]!r}" for value in lost]} if lost else {}
+            for stage in stages:
+                fellows = [s.name for s in stages if s.group == stage.group and s not in chosen]
+                if stage.group is not None and fellows:
+                    more.setdefault(stage.name, [f"stage {fellows[0]!r}"])
+            more = {name: what for name, what in more.items() if name not in lacks}
+            if not more:
+                named = [stage.name for stage in stages if stage.name in lacks and stage.name not in unneeded]
+                return [s for s in chosen if s.name not in lacks], {name: lacks[name] for name in named}
+            lacks |= more
 
     def active(self, history: Frames, target: Frame, future: Frames = ()) -> tuple[Stage, ...]:
         """The stages that run on frames like these; none where a rendered target is returned as it is.
@@ -250,14 +284,13 @@ class Method:
         Raises:
             ValueError: a stage that the method cannot do without lacks something, named in the message.
         """
-        stages = []
-        for stage in self._on(target):
-            lacks = self._lacks(stage, history, target, future)
-            if not lacks:
-                stages.append(stage)
-            elif not stage.optional:
-                raise ValueError(f"method {self.name!r}, stage {stage.name!r}: missing {', '.join(lacks)}")
-        return tuple(stages)
+        chosen, lacks = self._chosen(history, target, future)
+        for stage in self.stages:
+            if stage.name in lacks and not stage.optional:
+                raise ValueError(f"method {self.name!r}, stage {stage.name!r}: missing {', '.join(lacks[stage.name])}")
+        if target.color is None and not chosen:
+            raise ValueError(f"method {self.name!r}: generates no frames, it only takes rendered ones")
+        return tuple(chosen)
 
     def _lacks(self, stage: Stage, history: Frames, target: Frame, future: Frames) -> list[str]:
         sources = [history[i] for i in rendered(history)][: self.past]
@@ -349,7 +382,7 @@ class Method:
                     f"method {self.name!r}, stage {stage.name!r}: runs on the host, where nothing can be traced; "
                     "call the method or its step outside of jit, grad and vmap"
                 )
-            values |= stage.function(state, values)
+            values |= stage(state, values)
         return values
 
     def _by_turns(self, carry, history, target, future):
@@ -404,7 +437,7 @@ class Method:
     @cached_property
     def jitted_stages(self) -> dict[str, Callable[[Any, Values], dict[str, Any]]]:
         """Each stage on its own, compiled but for those on the host: for timing stage by stage."""
-        return {stage.name: stage.function if stage.host else jax.jit(stage.function) for stage in self.stages}
+        return {stage.name: stage if stage.host else jax.jit(stage) for stage in self.stages}
 
     def init(self, history: Frames, target: Frame) -> Any:
         """The carry before the first step; `()` for methods without memory."""

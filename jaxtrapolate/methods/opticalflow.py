@@ -82,5 +82,10 @@ def dis() -> Method:
         second = backward_warp(values["next"].color, rest * (rest * forward - alpha * backward))
         return {"image": mix(first, second, evenly(alpha, first))}
 
-    stages = (PAIR, Stage("optical flow", flow, host=True, extra="flow"), Stage("fetch", function))
+    pair, flows = ("previous", "next"), ("forward", "backward")
+    stages = (
+        PAIR,
+        Stage("optical flow", flow, pair, flows, host=True, extra="flow"),
+        Stage("fetch", function, (*pair, *flows, "alpha"), ("image",)),
+    )
     return Method("dis", stages, kind="interpolation", future=1, settings=FlowSettings())

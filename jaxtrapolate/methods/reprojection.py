@@ -10,8 +10,10 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.bidirectional.assisted import agree
 from jaxtrapolate.bidirectional.flows import camera_flow
+from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.between import depth_of
-from jaxtrapolate.methods.method import Frames, Method, Stage, Values, rendered
+from jaxtrapolate.methods.frames import Frames, rendered
+from jaxtrapolate.methods.method import Method, Stage, Values
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.stages import REPROJECT, SKY
 from jaxtrapolate.ops.depth import changed
@@ -59,7 +61,7 @@ def reprojection(shade: Shade | None = None) -> Method:
 
     def test(state, values: Values):
         motion, expected = values["motion"], values["target"].gbuffer.depth
-        expected = changed(expected, values["change"]) if "change" in values else expected
+        expected = expected if values["change"] is None else changed(expected, values["change"])
         found = backward_warp(values["newest"].gbuffer.depth, motion, filter="nearest")
         return {
             "missed": ~(
@@ -71,17 +73,17 @@ def reprojection(shade: Shade | None = None) -> Method:
     def fetch(state, values: Values):
         image = backward_warp(values["newest"].color, values["motion"])
         if shade is not None:
-            missed = values["missed"] if "missed" in values else ~in_frame(values["motion"])
+            missed = ~in_frame(values["motion"]) if values["missed"] is None else values["missed"]
             image = jnp.where(missed[..., None], shade(values["target"], missed).astype(image.dtype), image)
         return {"image": image}
 
-    cameras = ("target.position", "target.camera", "history.camera")
+    both, cameras = ("newest", "target"), ("target.position", "target.camera", "history.camera")
     depths = ("target.depth", "history.depth")
     stages = (
         REPROJECT,
-        Stage("change of depth", change, reads=cameras, optional=True),
-        Stage("depth test", test, reads=depths, optional=True),
-        Stage("fetch", fetch),
+        Stage("change of depth", change, both, ("change",), reads=cameras, optional=True),
+        Stage("depth test", test, (*both, "motion", "change?"), ("missed",), reads=depths, optional=True),
+        Stage("fetch", fetch, (*both, "motion", "missed?"), ("image",)),
         SKY,
     )
     return Method("reproject" if shade is None else "reproject_shade", stages, settings=DepthTest())
@@ -109,7 +111,7 @@ def _newest(state, values: Values):
     return {"newest": history[rendered(history)[0]], "steps": steps_onward(history, values["target"])}
 
 
-NEWEST = Stage("newest", _newest, reads=("history.color",))
+NEWEST = Stage("newest", _newest, ("history", "target"), ("newest", "steps"), reads=("history.color",))
 """Finds the newest rendered frame and how far ahead the target is."""
 
 
@@ -119,11 +121,13 @@ def _linear(state, values: Values):
     newest, motion = history[index], history[index].motion
     if index and (difference := jitter_difference(newest, history[index - 1])) is not None:
         motion = motion - difference.astype(motion.dtype)  # surfaces move, whatever the jitter does
-    onward = -values["steps"].astype(motion.dtype) * motion
-    return {"onward": shift_motion(onward, newest, target)}
+    along = -values["steps"].astype(motion.dtype) * motion
+    return {"linear": shift_motion(along, newest, target)}
 
 
-LINEAR = Stage("linear motion", _linear, reads=("history.motion",), optional=True)
+LINEAR = Stage(
+    "linear motion", _linear, ("history", "target", "steps"), ("linear",), reads=("history.motion",), optional=True
+)
 """The motion to the frame before, turned around and scaled by time: all goes on moving on the screen as it did."""
 
 
@@ -131,20 +135,35 @@ def _camera(state, values: Values):
     newest, target = values["newest"], values["target"]
     buffers = newest.gbuffer
     flow = camera_flow(buffers.position, newest.camera, target.camera)
-    exact, onward = flow[..., :2], values.get("onward")
-    if onward is not None:
-        still = jnp.zeros((*exact.shape[:2], 1), bool) if buffers.stencil is None else buffers.stencil == 0
-        still = still if buffers.sky is None else still & (buffers.sky < 0.5)
-        exact = jnp.where(still, exact, onward)
-        flow = jnp.where(still, flow, 0)
-    return {"onward": exact, "deeper": flow[..., 2:]}
+    still = jnp.zeros((*flow.shape[:2], 1), bool) if buffers.stencil is None else buffers.stencil == 0
+    still = still if buffers.sky is None else still & (buffers.sky < 0.5)
+    return {"exact": flow, "still": still}
 
 
-CAMERA = Stage("camera motion", _camera, reads=("history.position", "history.camera", "target.camera"), optional=True)
-"""The exact motion of what the stencil calls static, from both cameras; all of it where there are no motion vectors."""
+_CAMERAS = ("history.position", "history.camera", "target.camera")
 
-ONWARD_NEEDS = tuple(f"history.motion|{name}" for name in ("history.position", "history.camera", "target.camera"))
-"""What "onward" takes: motion vectors, or positions and both cameras."""
+CAMERA = Stage("camera motion", _camera, ("newest", "target"), ("exact", "still"), reads=_CAMERAS, optional=True)
+"""The exact motion and change of depth from both cameras, and of what the stencil calls static, so that it holds."""
+
+
+def _onward(state, values: Values):
+    linear, exact, still = (values[name] for name in ("linear", "exact", "still"))
+    if exact is None:
+        needs = "the motion of the newest rendered frame to the target"
+        return {"onward": check_present("motion, or positions and cameras", linear, needed_by=needs), "deeper": None}
+    if linear is None:
+        return {"onward": exact[..., :2], "deeper": exact[..., 2:]}
+    return {"onward": jnp.where(still, exact[..., :2], linear), "deeper": jnp.where(still, exact[..., 2:], 0)}
+
+
+ONWARD = Stage(
+    "onward",
+    _onward,
+    takes=("linear?", "exact?", "still?"),
+    gives=("onward", "deeper"),
+    reads=tuple(f"history.motion|{name}" for name in _CAMERAS),
+)
+"""The cameras' motion where that holds, else the linear one; all of one kind where the other is not there."""
 
 
 def carried_depth(values: Values) -> Array:
@@ -152,7 +171,7 @@ def carried_depth(values: Values) -> Array:
     depth = depth_of(values["newest"])
     if depth is None:
         return jnp.zeros_like(values["onward"][..., :1])
-    deeper = values.get("deeper")
+    deeper = values["deeper"]
     return depth if deeper is None else changed(depth, jnp.where(jnp.isfinite(deeper), deeper, 0))
 
 
@@ -198,5 +217,12 @@ def warp_3d() -> Method:
         known = None if depth_of(values["newest"]) is None else values["z"]
         return {"image": fill_around(values["warped"], values["covered"], depth=known)}
 
-    stages = (NEWEST, LINEAR, CAMERA, Stage("push", push, reads=ONWARD_NEEDS), Stage("fill", fill))
+    stages = (
+        NEWEST,
+        LINEAR,
+        CAMERA,
+        ONWARD,
+        Stage("push", push, ("newest", "onward", "deeper"), ("warped", "z", "covered")),
+        Stage("fill", fill, ("newest", "warped", "z", "covered"), ("image",)),
+    )
     return Method("warp_3d", stages, settings=DepthTest())

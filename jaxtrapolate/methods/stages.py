@@ -3,9 +3,9 @@
 Values they pass on: "sources", the rendered frames that are warped, newest first, and "motions", from the target to
 each of them; "newest" and "motion", the first of both. "masks", bool, for each source where it shows something else,
 and "holes", the first of them. "plain_share", where the colour as it is should be preferred, from
-`jaxtrapolate.methods.hindsight`. "layers", for each source the image that is to be warped: the demodulated colour where
-that can be, followed by the colour as it is where "plain_share" asks for both. "occlusion_motion". "warped", what was
-made of the layers for the target, and "image".
+`jaxtrapolate.methods.hindsight`. "layers", for each source the image that is to be warped: its colour, or where that
+can be the demodulated colour, followed by the colour as it is where "plain_share" asks for both. "occlusion_motion".
+"warped", what was made of the layers for the target, and "image".
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.methods.method import Stage, Values, rendered
+from jaxtrapolate.methods.frames import rendered
+from jaxtrapolate.methods.method import Stage, Values
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.ops.holes import Taps, hole_masks
 from jaxtrapolate.ops.motion import chain_motion, occlusion_motion
@@ -59,9 +60,21 @@ def reproject_stage(past: int = 1) -> Stage:
             motion, place = chain(frames, place, older, before=motion), older
             sources.append(history[older])
             motions.append(motion)
-        return {"newest": sources[0], "motion": motions[0], "sources": tuple(sources), "motions": tuple(motions)}
+        return {
+            "newest": sources[0],
+            "motion": motions[0],
+            "sources": tuple(sources),
+            "motions": tuple(motions),
+            "layers": tuple(jnp.asarray(source.color) for source in sources),
+        }
 
-    return Stage("reproject", function, reads=("target.motion", "since_newest.motion", "history.color"))
+    return Stage(
+        "reproject",
+        function,
+        takes=("history", "target"),
+        gives=("newest", "motion", "sources", "motions", "layers"),
+        reads=("target.motion", "since_newest.motion", "history.color"),
+    )
 
 
 REPROJECT = reproject_stage()
@@ -72,6 +85,9 @@ def reflecting(gbuffer: GBuffer | None, sky: bool) -> GBuffer:
     """The G-buffer as demodulation sees it."""
     gbuffer = check_present("gbuffer", gbuffer, needed_by="demodulation")
     return gbuffer if sky else replace(gbuffer, sky=None)
+
+
+_REFLECTANCE: Any = {"reads": ("history.albedo", "target.albedo"), "optional": True, "group": "demodulation"}
 
 
 def demodulate_stage(how: Any = None) -> Stage:
@@ -86,16 +102,11 @@ def demodulate_stage(how: Any = None) -> Stage:
         for source in values["sources"]:
             buffers = reflecting(source.gbuffer, given.sky)
             irradiance = demodulate(source.color, buffers, by=given.by, floor=given.floor)
-            both = "plain_share" in values
+            both = values["plain_share"] is not None
             layers.append(jnp.concatenate([irradiance, source.color], -1) if both else irradiance)
         return {"layers": tuple(layers)}
 
-    return Stage("demodulate", function, reads=("history.albedo", "target.albedo"), optional=True)
-
-
-def layers(values: Values) -> tuple[Array, ...]:
-    """What is to be warped: the demodulated colours, or the colours where that stage was left out."""
-    return values["layers"] if "layers" in values else tuple(source.color for source in values["sources"])
+    return Stage("demodulate", function, ("sources", "plain_share?"), ("layers",), **_REFLECTANCE)
 
 
 def modulate_stage(how: Any = None) -> Stage:
@@ -110,14 +121,16 @@ def modulate_stage(how: Any = None) -> Stage:
         given = how or state.settings
         buffers = reflecting(values["target"].gbuffer, given.sky)
         image = modulate(values["warped"][..., :3], buffers, by=given.by, floor=given.floor)
-        if "plain_share" in values:
-            share, own = values["plain_share"], values["warped"][..., 3:]
+        share = values["plain_share"]
+        if share is not None:
+            own = values["warped"][..., 3:]
             exact = backward_warp(values["newest"].color, values["motion"])
             plain = jnp.where(values["holes"] | (share < 1), own, exact)
             image = image * (1 - share) + plain * share
         return {"image": image}
 
-    return Stage("modulate", function, reads=("history.albedo", "target.albedo"), optional=True)
+    takes = ("warped", "target", "plain_share?", "newest", "motion", "holes")
+    return Stage("modulate", function, takes, ("image",), **_REFLECTANCE)
 
 
 def _sky(state, values: Values):
@@ -125,7 +138,7 @@ def _sky(state, values: Values):
     return {"image": jnp.where(buffers.sky > 0.5, jnp.asarray(buffers.sky_color, image.dtype), image)}
 
 
-SKY = Stage("sky", _sky, reads=("target.sky", "target.sky_color"), optional=True)
+SKY = Stage("sky", _sky, ("target", "image"), ("image",), reads=("target.sky", "target.sky_color"), optional=True)
 """Takes the sky as the engine drew it for the target."""
 
 
@@ -133,8 +146,12 @@ def _occlusion(state, values: Values):
     return {"occlusion_motion": occlusion_motion(values["motion"], values["target"].gbuffer.depth)}
 
 
-OCCLUSION = Stage("occlusion motion", _occlusion, reads=("target.depth",))
+OCCLUSION = Stage("occlusion motion", _occlusion, ("motion", "target"), ("occlusion_motion",), reads=("target.depth",))
 """The motion of what hid the holes."""
+
+
+COMPOSITE = ("motion", "holes", "occlusion_motion?")
+"""What `composite` takes."""
 
 
 def composite(
@@ -144,7 +161,7 @@ def composite(
 
     Guo et al. 2021 (ExtraNet), section 4.2.
     """
-    motion, occluder = values["motion"], values.get("occlusion_motion")
+    motion, occluder = values["motion"], values["occlusion_motion"]
     along = motion if occluder is None else jnp.where(values["holes"], occluder, motion)
     return backward_warp(image, along, outside=outside)
 
@@ -168,7 +185,7 @@ def holes_stage(taps: Taps = "nearest", **options) -> Stage:
         masks = tuple(find_holes(buffers, source.gbuffer, motion, taps=taps, **options) for source, motion in pairs)
         return {"holes": masks[0], "masks": masks}
 
-    return Stage("holes", function)
+    return Stage("holes", function, ("target", "sources", "motions"), ("holes", "masks"))
 
 
 HOLES = holes_stage()

@@ -4,10 +4,12 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.methods.hindsight import HINDSIGHT
-from jaxtrapolate.methods.method import Method, Stage, Values, rendered
+from jaxtrapolate.methods.method import Method, Stage, Values
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.stages import (
+    COMPOSITE,
     HOLES,
     OCCLUSION,
     REPROJECT,
@@ -15,7 +17,6 @@ from jaxtrapolate.methods.stages import (
     Demodulation,
     composite,
     demodulate_stage,
-    layers,
     modulate_stage,
 )
 from jaxtrapolate.ops.guided import far_motion, guided_warp
@@ -29,7 +30,7 @@ def repeat() -> Method:
         history = values["history"]
         return {"image": history[rendered(history)[0]].color}
 
-    return Method("repeat", (Stage("repeat", function, reads=("history.color",)),))
+    return Method("repeat", (Stage("repeat", function, ("history",), ("image",), reads=("history.color",)),))
 
 
 @settings
@@ -45,14 +46,16 @@ def warp() -> Method:
     def function(state, values: Values):
         return {"image": backward_warp(values["newest"].color, values["motion"], filter=state.settings.filter)}
 
-    return Method("warp", (REPROJECT, Stage("warp", function), SKY), settings=WarpSettings())
+    return Method(
+        "warp", (REPROJECT, Stage("warp", function, ("newest", "motion"), ("image",)), SKY), settings=WarpSettings()
+    )
 
 
 def occlusion_warp() -> Method:
     """The demodulated frame along the motion, in holes along the occluder's (the occlusion composite of ExtraNet)."""
 
     def function(state, values: Values):
-        warped = composite(values, layers(values)[0])
+        warped = composite(values, values["layers"][0])
         return {"warped": warped, "image": warped[..., :3]}
 
     stages = (
@@ -61,7 +64,7 @@ def occlusion_warp() -> Method:
         HOLES,
         HINDSIGHT,
         demodulate_stage(),
-        Stage("composite", function),
+        Stage("composite", function, ("layers", *COMPOSITE), ("warped", "image")),
         modulate_stage(),
         SKY,
     )
@@ -117,11 +120,17 @@ def fetch_guided(image, motion, holes, target, source, how: Any):
 
 def _guided(state, values: Values):
     frames = values["target"].gbuffer, values["newest"].gbuffer
-    warped = fetch_guided(layers(values)[0], values["motion"], values["holes"], *frames, state.settings)
+    warped = fetch_guided(values["layers"][0], values["motion"], values["holes"], *frames, state.settings)
     return {"warped": warped, "image": warped[..., :3]}
 
 
-GUIDED = Stage("guided warp", _guided, reads=(guides_of("newest"),))
+GUIDED = Stage(
+    "guided warp",
+    _guided,
+    takes=("target", "newest", "layers", "motion", "holes"),
+    gives=("warped", "image"),
+    reads=(guides_of("newest"),),
+)
 """Fetches the newest layer from the most similar pixels around where the motion leads; see `fetch_guided`."""
 
 
