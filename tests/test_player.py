@@ -14,11 +14,10 @@ from jaxtrapolate.commands.generate import Work
 from jaxtrapolate.evaluation.evaluate import Evaluation
 from jaxtrapolate.evaluation.player import Player, play
 from jaxtrapolate.evaluation.schedule import (
-    between_slots,
     held_back_slots,
     missing_slots,
     needed_slots,
-    onward_slots,
+    virtual_slots,
 )
 from jaxtrapolate.evaluation.windows import Window, held_back, hidden, hide, load
 from jaxtrapolate.methods import Method, Stage, neighbours
@@ -197,7 +196,7 @@ def test_nothing_held_back_is_seen():
 
 def test_virtual_frames():
     sequence = SyntheticSequence(range(4))
-    slots = between_slots(sequence, past=2, factor=3)
+    slots = virtual_slots(sequence, "between", past=2, factor=3)
     assert [(s.number, s.fraction) for s in slots if not s.rendered] == [
         (n, Fraction(k, 3)) for n in (0, 1, 2) for k in (1, 2)
     ]
@@ -206,7 +205,7 @@ def test_virtual_frames():
         (False, (1,), (3,)),
         (False, (1,), (3,)),
     ]
-    onward = onward_slots(sequence, past=1, factor=2)
+    onward = virtual_slots(sequence, "onward", past=1, factor=2)
     assert [s.number for s in onward if not s.rendered] == [0, 1, 2, 3]
     (_, window), *_ = load(sequence, [s for s in onward if s.number == 2 and not s.rendered])
     assert float(window.target.time) == 2.5

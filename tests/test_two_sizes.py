@@ -8,12 +8,13 @@ from oracles import look, perspective
 from synthetic import SyntheticSequence, make_frame, make_keyframe
 
 import jaxtrapolate as jx
+from jaxtrapolate.commands.evaluate import Request, evaluate_into
 from jaxtrapolate.errors import InputError
 from jaxtrapolate.evaluation.evaluate import Evaluation
 from jaxtrapolate.evaluation.pictures import Gallery
 from jaxtrapolate.evaluation.schedule import held_back_slots
 from jaxtrapolate.evaluation.windows import arguments, windows
-from jaxtrapolate.files import open_sequence, read_png, runs, write_unreal_frame
+from jaxtrapolate.files import open_sequence, read_png, runs, write_exr, write_unreal_frame
 from jaxtrapolate.methods import Method, Stage
 from jaxtrapolate.ops.jitter import on_own_pixels, shift_camera
 from jaxtrapolate.scenes import SceneSequence
@@ -210,3 +211,30 @@ def test_pictures_of_two_sizes_are_png(tmp_path):
     (window,) = windows(Pair(), [3], past=1)
     described = gallery.describe(Pair(), window, ["twice"])
     assert read_png(tmp_path / described["methods"]["twice"]["error"]).shape == (64, 96, 3)
+
+
+def test_larger_frames_that_have_changed_are_noticed(tmp_path):
+    """What scores depend on, as much as the frames themselves."""
+    small, large = dumped(tmp_path / "small", SIZE), dumped(tmp_path / "large", (64, 96))
+    (small / "jaxtrapolate.toml").write_text('larger = "../large"\n')
+    request = Request({"twice": twice()}, pictures=0)
+
+    def run(output):
+        return evaluate_into(open_sequence(small), request, tmp_path / output, step=lambda *_: None)
+
+    first = run("a").methods["twice"].psnr
+    assert run("a").methods["twice"].psnr == first
+    write_exr(large / "WallPreTonemapHDRColor.0001.exr", np.zeros((64, 96, 3), np.float32))
+    with pytest.raises(InputError, match=r"WallPreTonemapHDRColor\.0001\.exr \(frame 1 of the input\) has changed"):
+        run("a")
+    assert run("b").methods["twice"].psnr < first
+
+
+def test_larger_frames_are_read_for_methods_that_are_scored_by_them_alone(monkeypatch):
+    sequence, read = Pair(), []
+    real = sequence.larger.frame
+    monkeypatch.setattr(sequence.larger, "frame", lambda number: read.append(number) or real(number))
+    jx.evaluate(sequence, ["warp"])
+    assert read == []
+    jx.evaluate(sequence, {"twice": twice()}, frames=[3])
+    assert 3 in read

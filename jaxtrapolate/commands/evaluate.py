@@ -196,6 +196,8 @@ def evaluate_into(sequence: Sequence, request: Request, folder: Path, *, reuse: 
             unavailable=request.unavailable,
         )
         output.agree_frames(sequence, evaluation.reads(), step=step)
+        if evaluation.larger and sequence.larger is not None:
+            output.agree_frames(sequence.larger, evaluation.reads(), kind="larger frames", step=step)
         if reuse and (there := _finished(output.folder, request.settings(sequence))) is not None:
             return there
         kept = Scores(writable_folder(output.folder / "scores"), request.metrics)

@@ -23,7 +23,7 @@ from jaxtrapolate.commands.inputs import (
 )
 from jaxtrapolate.errors import InputError
 from jaxtrapolate.evaluation.player import play
-from jaxtrapolate.evaluation.schedule import Slot, between_slots, missing_slots, needed_slots, onward_slots
+from jaxtrapolate.evaluation.schedule import Slot, missing_slots, needed_slots, virtual_slots
 from jaxtrapolate.evaluation.windows import arguments, load
 from jaxtrapolate.files import Sequence, write_frame
 from jaxtrapolate.files.reader import stored_size
@@ -83,9 +83,12 @@ class Work:
         if not all(map(sequence.has_color, sequence.numbers)):
             slots, how = missing_slots(sequence, past=past, future=future), "from the buffers drawn for them"
         elif method.kind == "interpolation":
-            slots, how = between_slots(sequence, past=past, factor=factor), "between each two rendered frames"
+            slots, how = (
+                virtual_slots(sequence, "between", past=past, factor=factor),
+                "between each two rendered frames",
+            )
         else:
-            slots = onward_slots(sequence, past=past, factor=factor)
+            slots = virtual_slots(sequence, "onward", past=past, factor=factor)
             how = "after each rendered frame, by its motion carried on: no buffers were drawn for them"
         return cls(sequence, method, slots, how, factor)
 

@@ -144,6 +144,11 @@ class Evaluation:
         return cls(sequence, usable, metrics, slots, tuple(numbers), factor, past, future, skipped, left_out)
 
     @property
+    def larger(self) -> bool:
+        """Whether some method is scored at the size of the input's larger frames."""
+        return any(method.scale > 1 for method in self.methods.values())
+
+    @property
     def hidden(self) -> set[int]:
         """The numbers of the frames that are held back, scored or not."""
         return {slot.number for slot in self.slots if not slot.rendered}
@@ -170,6 +175,7 @@ class Evaluation:
             self.methods,
             wanted=lambda name, slot: slot.number in chosen and wanted(name, slot.number),
             hidden=self.hidden,
+            larger=self.larger,
         )
 
     def run(
@@ -195,7 +201,7 @@ class Evaluation:
         kept = Scores(None, self.metrics) if kept is None else kept
         scores = {number: kept.frame(number) for number in self.numbers}
         clips = kept.clips(list(self.numbers))
-        lacking = {name for name in self.methods if self._clip_metrics - set(clips.get(name, {}))}
+        lacking = {name for name in self.methods if set(self._clip_metrics) - set(clips.get(name, {}))}
 
         def wanted(name: str, number: int) -> bool:
             if name not in scores[number]:
@@ -226,8 +232,8 @@ class Evaluation:
         return self._results(by_method, clips, kept, unscored)
 
     @property
-    def _clip_metrics(self) -> set[str]:
-        return {m.name for m in self.metrics.values() if m.per == "clip"}
+    def _clip_metrics(self) -> list[str]:
+        return [m.name for m in self.metrics.values() if m.per == "clip"]
 
     def _score_clips(
         self,
@@ -259,7 +265,7 @@ class Evaluation:
             yield gallery.codes(name, found.number)
 
     def _true_clip(self, gallery: Gallery, scale: int) -> Iterator[Any]:
-        for _, window in load(self.sequence, self._scored):
+        for _, window in load(self.sequence, self._scored, larger=scale > 1):
             truth = window.truth if scale == 1 or window.larger is None else window.larger
             yield eight_bit(gallery.display(truth.color))
 

@@ -113,6 +113,7 @@ def play(
     *,
     wanted: Callable[[str, Slot], bool] | None = None,
     hidden: Collection[int] = (),
+    larger: bool = False,
 ) -> Iterator[tuple[Slot, Window, dict[str, Generated]]]:
     """Generates frames of a sequence with methods, in one pass over it.
 
@@ -123,6 +124,7 @@ def play(
         wanted: whether a frame is to be generated with a method; every frame that is not rendered by default. What a
             method with memory has to see before that is replayed.
         hidden: the numbers of the frames that are held back.
+        larger: whether windows hold the frames at the output's size as well, as of `load`.
 
     Yields:
         Each frame of which something was generated, its window, and what was generated, by the methods' names.
@@ -134,7 +136,9 @@ def play(
     asked = {n: [not s.rendered and (wanted is None or wanted(n, s)) for s in slots] for n in methods}
     shown = {n: needed_slots(slots, asked[n], memory=m.memory) for n, m in methods.items()}
     rows = [i for i in range(len(slots)) if any(flags[i] for flags in shown.values())]
-    for i, (slot, window) in zip(rows, load(sequence, [slots[i] for i in rows], hidden=hidden), strict=True):
+    for i, (slot, window) in zip(
+        rows, load(sequence, [slots[i] for i in rows], hidden=hidden, larger=larger), strict=True
+    ):
         generated = {}
         for name, player in players.items():
             result = player.show(window, first=slot.first) if shown[name][i] else None

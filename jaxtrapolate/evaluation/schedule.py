@@ -2,7 +2,7 @@
 
 Three schedules: every N-th frame is rendered and those between are held back (`held_back_slots`); frames without colour
 are generated from the buffers drawn for them (`missing_slots`); frames are put between or after rendered ones, for
-which nothing was drawn (`between_slots`, `onward_slots`). Each run of frames without a gap or a cut starts anew.
+which nothing was drawn (`virtual_slots`). Each run of frames without a gap or a cut starts anew.
 """
 
 import dataclasses
@@ -100,47 +100,33 @@ def missing_slots(sequence: Sequence, *, past: int, future: int = 0) -> list[Slo
     return [s for run in runs(sequence) for s in _slots(run, [sequence.has_color(n) for n in run], past, future)]
 
 
-def between_slots(sequence: Sequence, *, past: int, factor: int) -> list[Slot]:
-    """All frames, which are rendered, and `factor` - 1 between each two of them.
+def virtual_slots(sequence: Sequence, virtual: Virtual, *, past: int, factor: int) -> list[Slot]:
+    """All frames, which are rendered, and `factor` - 1 after each for which nothing was drawn.
 
     Args:
         sequence: the frames, all with colour.
+        virtual: how the targets are had, see `Slot`; none of "between" comes after a run's last frame.
         past: rendered frames of history that are wanted.
         factor: frame rate out over frame rate in.
     """
-    return list(_put_between(sequence, past, factor, "between"))
-
-
-def onward_slots(sequence: Sequence, *, past: int, factor: int) -> list[Slot]:
-    """All frames, which are rendered, and `factor` - 1 after each, to which the frame's motion is carried on.
-
-    Args:
-        sequence: the frames, all with colour.
-        past: rendered frames of history that are wanted.
-        factor: frame rate out over frame rate in.
-    """
-    return list(_put_between(sequence, past, factor, "onward"))
-
-
-def _put_between(sequence: Sequence, past: int, factor: int, virtual: Virtual) -> Iterator[Slot]:
+    found: list[Slot] = []
     for run in runs(sequence):
         for i, slot in enumerate(_slots(run, [True] * len(run), past, 0)):
-            yield slot
+            found.append(slot)
             if virtual == "between" and i + 1 == len(run):
                 break
-            older = tuple(run[max(0, i + 1 - past) : i])
+            generated = dataclasses.replace(
+                slot,
+                before=tuple(run[max(0, i + 1 - past) : i]),
+                behind=(run[i + 1],) if virtual == "between" else (),
+                rendered=False,
+                first=False,
+                full=i + 1 >= past,
+                virtual=virtual,
+            )
             for k in range(1, factor):
-                yield Slot(
-                    number=slot.number,
-                    before=older,
-                    behind=(run[i + 1],) if virtual == "between" else (),
-                    rendered=False,
-                    first=False,
-                    full=i + 1 >= past,
-                    distance=k,
-                    fraction=Fraction(k, factor),
-                    virtual=virtual,
-                )
+                found.append(dataclasses.replace(generated, distance=k, fraction=Fraction(k, factor)))
+    return found
 
 
 def needed_slots(slots: Items[Slot], wanted: Items[bool], *, memory: bool) -> list[bool]:

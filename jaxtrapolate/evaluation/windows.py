@@ -75,13 +75,16 @@ def hidden(sequence: Sequence, *, factor: int = 2) -> set[int]:
     return {slot.number for slot in held_back_slots(sequence, past=0, factor=factor) if not slot.rendered}
 
 
-def load(sequence: Sequence, slots: Iterable[Slot], *, hidden: Collection[int] = ()) -> Iterator[tuple[Slot, Window]]:
+def load(
+    sequence: Sequence, slots: Iterable[Slot], *, hidden: Collection[int] = (), larger: bool = False
+) -> Iterator[tuple[Slot, Window]]:
     """Frames of a schedule with what surrounds them, on the device; each frame of the input is read once.
 
     Args:
         sequence: the frames.
         slots: in order of display.
         hidden: the numbers of frames that are held back: their windows hold the truth, and `hide` of it elsewhere.
+        larger: whether windows hold the frame at the output's size as well, where the sequence has it.
     """
     slots = list(slots)
     waiting = iter(slots)
@@ -91,7 +94,7 @@ def load(sequence: Sequence, slots: Iterable[Slot], *, hidden: Collection[int] =
         cached[number] = jax.device_put(frame)
         while slot is not None and number == slot.numbers[-1]:
             window = _window(slot, cached, hidden, sequence.step)
-            if sequence.larger is not None and slot.virtual is None:
+            if larger and sequence.larger is not None and slot.virtual is None:
                 window = replace(window, larger=jax.device_put(sequence.larger.frame(slot.number)))
             yield slot, window
             slot = next(waiting, None)

@@ -6,7 +6,7 @@ compiling anew. All else (integers, choices, switches, tuples) sets shapes, loop
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, get_args
 
 import jax
@@ -174,13 +174,7 @@ def replaced(owner: str, given: S, values: Mapping[str, Any]) -> S:
     Raises:
         ValueError: an unknown option, or a value that it may not have; lists the options of the `owner`.
     """
-    options, found = options_of(given), {}
-    for name, value in values.items():
-        known = _named(owner, options, name)
-        try:
-            found[name] = known.checked(value)
-        except ValueError:
-            raise ValueError(f"{owner}, {name}: expected {known.allowed}, got {value!r}; {_listed(options)}") from None
+    found = _each(owner, given, values, Option.checked)
     return dataclasses.replace(given, **found) if found else given  # type: ignore[type-var]
 
 
@@ -190,11 +184,16 @@ def parsed(owner: str, given: Any, texts: Mapping[str, str]) -> dict[str, Any]:
     Raises:
         ValueError: an unknown option, or a text that is no such value; lists the options of the `owner`.
     """
+    return _each(owner, given, texts, Option.parsed)
+
+
+def _each(owner: str, given: Any, values: Mapping[str, Any], taken: Callable[[Option, Any], Any]) -> dict[str, Any]:
+    """What each value becomes by `taken`, its option's method."""
     options, found = options_of(given), {}
-    for name, text in texts.items():
+    for name, value in values.items():
         known = _named(owner, options, name)
         try:
-            found[name] = known.parsed(text)
+            found[name] = taken(known, value)
         except ValueError:
-            raise ValueError(f"{owner}, {name}: expected {known.allowed}, got {text!r}; {_listed(options)}") from None
+            raise ValueError(f"{owner}, {name}: expected {known.allowed}, got {value!r}; {_listed(options)}") from None
     return found

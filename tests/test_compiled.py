@@ -1,0 +1,70 @@
+"""Compiled programs that outlive a process: where commands keep them, and what is said of those read from there."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+VARIABLES = (
+    "JAX_COMPILATION_CACHE_DIR",
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
+    "JAX_COMPILATION_CACHE_MAX_SIZE",
+)
+
+
+@pytest.fixture
+def environment(tmp_path):
+    """As a user has it, with a cache folder of his own."""
+    kept = {k: v for k, v in os.environ.items() if k not in VARIABLES}
+    return kept | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "HOME": str(tmp_path)}
+
+
+def evaluate(environment, folder, *options):
+    """The results of an evaluation in a process of its own."""
+    command = [sys.executable, "-m", "jaxtrapolate", *options, "evaluate", "scenes:still", "--length", "4"]
+    command += ["--size", "32x18", "--methods", "guided_warp", "--pictures", "0", "--output", str(folder)]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    return json.loads((folder / "results.json").read_text()), ended.stdout
+
+
+def test_a_second_run_reads_what_the_first_compiled(environment, tmp_path):
+    first, _ = evaluate(environment, tmp_path / "a")
+    kept = list((tmp_path / "cache" / "jaxtrapolate" / "compiled").iterdir())
+    assert any("jit" in path.name for path in kept)
+    second, out = evaluate(environment, tmp_path / "b")
+    times = [results["methods"]["guided_warp"]["ms"] for results in (first, second)]
+    assert "cached" not in times[0]
+    assert times[1]["cached"] is True
+    assert times[1]["compile"] < times[0]["compile"]
+    assert "(cached)" in out
+    assert "(cached)" in (tmp_path / "b" / "report.html").read_text()
+    frames = [[f["psnr"] for f in results["methods"]["guided_warp"]["frames"]] for results in (first, second)]
+    assert frames[0] == frames[1]
+
+
+def test_it_can_be_turned_off_or_moved(environment, tmp_path):
+    off, _ = evaluate(environment, tmp_path / "a", "--no-compile-cache")
+    assert "cached" not in off["methods"]["guided_warp"]["ms"]
+    folder = tmp_path / "cache" / "jaxtrapolate" / "compiled"
+    assert not any("jit" in path.name for path in folder.iterdir())
+    moved = environment | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "mine")}
+    evaluate(moved, tmp_path / "b")
+    assert any("jit" in path.name for path in (tmp_path / "mine").iterdir())
+    assert not any("jit" in path.name for path in folder.iterdir())
+
+
+def test_a_cache_that_cannot_be_is_none(environment, tmp_path):
+    """A file stands where the folder should be."""
+    (tmp_path / "cache").write_text("in the way")
+    results, _ = evaluate(environment, tmp_path / "a")
+    assert "cached" not in results["methods"]["guided_warp"]["ms"]
+
+
+def test_importing_the_library_keeps_nothing(environment, tmp_path):
+    code = "import jaxtrapolate, jax, os; jaxtrapolate.load('warp'); print(jax.config.jax_compilation_cache_dir)"
+    ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert ended.stdout.strip() == "None"
+    assert not (tmp_path / "cache").exists()
