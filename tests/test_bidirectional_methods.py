@@ -59,6 +59,7 @@ def test_a_rendered_target_is_returned(methods, name):
     np.testing.assert_array_equal(methods[name](history, rendered, future), truth)
 
 
+@pytest.mark.slow
 def test_the_target_is_not_looked_at_by_the_image_based_one(methods):
     method = methods["bidirectional_image"]
     history, target, future, _ = window(method=method)
@@ -71,6 +72,7 @@ def test_the_target_is_not_looked_at_by_the_image_based_one(methods):
     np.testing.assert_array_equal(image, method(history, strange, future))
 
 
+@pytest.mark.slow
 def test_with_nothing_drawn_of_the_target_points_are_searched(methods):
     history, target, future, _ = window(method=methods["bidirectional"])
     to_previous = replace(future[0], motion=future[0].motion * 2)  # over both steps, as an engine at half rate writes
@@ -112,7 +114,9 @@ def test_fog_does_not_print_a_texture(methods):
     assert db(method(history, target, future), truth) > db(plain, truth) - 0.5
 
 
-@pytest.mark.parametrize("name", ["bidirectional", "bidirectional_guided", "bidirectional_image"])
+@pytest.mark.parametrize(
+    "name", ["bidirectional", pytest.param("bidirectional_guided", marks=pytest.mark.slow), "bidirectional_image"]
+)
 def test_what_stands_still_stays_as_it_is(methods, name):
     frame = make_frame(0)
     still = jax.tree.map(jnp.asarray, replace(frame, motion=np.zeros_like(frame.motion)))

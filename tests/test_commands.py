@@ -72,6 +72,7 @@ def test_check_reports_buffers_convention_and_methods(capsys, dump):
     "convention",
     ["previous_minus_current,pixels,up", pytest.param("current_minus_previous,pixels,down", marks=pytest.mark.slow)],
 )
+@pytest.mark.slow
 def test_check_finds_the_convention(capsys, dump, convention):
     """The reader is told a wrong one; check names the right one."""
     code, out, _ = run(capsys, "check", dump, "--motion", convention)
@@ -88,6 +89,7 @@ def test_check_of_uv_vectors(capsys, dump, tmp_path):
     assert "--motion current_minus_previous,uv,up" in " ".join(out.split())
 
 
+@pytest.mark.slow
 def test_check_of_a_packed_clip(capsys, clip):
     code, out, _ = run(capsys, "check", clip)
     assert code == 0

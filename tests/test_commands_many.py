@@ -161,6 +161,7 @@ def test_nothing_that_can_be_used(capsys, tmp_path):
     assert list(output.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_and_what_is_finished_stays(capsys, scenes, tmp_path, monkeypatch):
     scored, real = [], module.score_window
 
@@ -203,6 +204,7 @@ def test_a_killed_run_goes_on_and_what_is_finished_stays(capsys, scenes, tmp_pat
     assert (tmp_path / "demo-1" / "report.html").exists()
 
 
+@pytest.mark.slow
 def test_exact_frames_survive_a_killed_run(capsys, tmp_path, monkeypatch):
     """Infinite dB are kept as such, and a later run works with them."""
 
@@ -218,6 +220,7 @@ def test_exact_frames_survive_a_killed_run(capsys, tmp_path, monkeypatch):
         (tmp_path / "results.json").unlink()
 
 
+@pytest.mark.slow
 def test_seeds_share_one_compilation(capsys, scenes, tmp_path, monkeypatch):
     loaded = []
     monkeypatch.setattr(inputs_module, "load", lambda name: loaded.append(jx.load(name)) or loaded[-1])

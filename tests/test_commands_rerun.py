@@ -183,6 +183,7 @@ LONGER = [pytest.param(content, marks=pytest.mark.slow) for content in ("[]", '{
 
 
 @pytest.mark.parametrize("content", ["{", '{"repeat": {"number": 1}}', *LONGER])
+@pytest.mark.slow
 def test_kept_scores_of_another_shape_are_computed_again(capsys, still_dump, tmp_path, content):
     common = ("evaluate", still_dump, "--methods", "repeat", "--pictures", 0, "--frames", "1", "--output", tmp_path)
     assert run(capsys, *common)[0] == 0
@@ -304,6 +305,7 @@ def test_paths_that_lead_nowhere(capsys, tmp_path):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+@pytest.mark.slow
 def test_a_full_standard_output():
     with open("/dev/full", "w") as full:
         done = subprocess.run(

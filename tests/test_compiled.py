@@ -6,6 +6,9 @@ import subprocess
 import sys
 
 import pytest
+from synthetic import make_frame
+
+from jaxtrapolate.files import write_unreal_frame
 
 VARIABLES = (
     "JAX_COMPILATION_CACHE_DIR",
@@ -21,46 +24,57 @@ def environment(tmp_path):
     return kept | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "HOME": str(tmp_path)}
 
 
-def evaluate(environment, folder, *options):
+@pytest.fixture(scope="module")
+def dump(tmp_path_factory):
+    """Frames that need not be rendered."""
+    folder = tmp_path_factory.mktemp("dump")
+    for time in range(3):
+        write_unreal_frame(folder, "Wall", time, make_frame(time, (18, 32)))
+    return folder
+
+
+def evaluate(environment, dump, folder, *options):
     """The results of an evaluation in a process of its own."""
-    command = [sys.executable, "-m", "jaxtrapolate", *options, "evaluate", "scenes:still", "--length", "4"]
-    command += ["--size", "32x18", "--methods", "guided_warp", "--pictures", "0", "--output", str(folder)]
+    command = [sys.executable, "-m", "jaxtrapolate", *options, "evaluate", str(dump), "--methods", "warp"]
+    command += ["--pictures", "0", "--output", str(folder)]
     ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
     return json.loads((folder / "results.json").read_text()), ended.stdout
 
 
-def test_a_second_run_reads_what_the_first_compiled(environment, tmp_path):
-    first, _ = evaluate(environment, tmp_path / "a")
+def test_a_second_run_reads_what_the_first_compiled(environment, dump, tmp_path):
+    first, _ = evaluate(environment, dump, tmp_path / "a")
     kept = list((tmp_path / "cache" / "jaxtrapolate" / "compiled").iterdir())
     assert any("jit" in path.name for path in kept)
-    second, out = evaluate(environment, tmp_path / "b")
-    times = [results["methods"]["guided_warp"]["ms"] for results in (first, second)]
+    second, out = evaluate(environment, dump, tmp_path / "b")
+    times = [results["methods"]["warp"]["ms"] for results in (first, second)]
     assert "cached" not in times[0]
     assert times[1]["cached"] is True
     assert times[1]["compile"] < times[0]["compile"]
     assert "(cached)" in out
     assert "(cached)" in (tmp_path / "b" / "report.html").read_text()
-    frames = [[f["psnr"] for f in results["methods"]["guided_warp"]["frames"]] for results in (first, second)]
+    frames = [[f["psnr"] for f in results["methods"]["warp"]["frames"]] for results in (first, second)]
     assert frames[0] == frames[1]
 
 
-def test_it_can_be_turned_off_or_moved(environment, tmp_path):
-    off, _ = evaluate(environment, tmp_path / "a", "--no-compile-cache")
-    assert "cached" not in off["methods"]["guided_warp"]["ms"]
+@pytest.mark.slow
+def test_it_can_be_turned_off_or_moved(environment, dump, tmp_path):
+    off, _ = evaluate(environment, dump, tmp_path / "a", "--no-compile-cache")
+    assert "cached" not in off["methods"]["warp"]["ms"]
     folder = tmp_path / "cache" / "jaxtrapolate" / "compiled"
     assert not any("jit" in path.name for path in folder.iterdir())
     moved = environment | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "mine")}
-    evaluate(moved, tmp_path / "b")
+    evaluate(moved, dump, tmp_path / "b")
     assert any("jit" in path.name for path in (tmp_path / "mine").iterdir())
     assert not any("jit" in path.name for path in folder.iterdir())
 
 
-def test_a_cache_that_cannot_be_is_none(environment, tmp_path):
+@pytest.mark.slow
+def test_a_cache_that_cannot_be_is_none(environment, dump, tmp_path):
     """A file stands where the folder should be."""
     (tmp_path / "cache").write_text("in the way")
-    results, _ = evaluate(environment, tmp_path / "a")
-    assert "cached" not in results["methods"]["guided_warp"]["ms"]
+    results, _ = evaluate(environment, dump, tmp_path / "a")
+    assert "cached" not in results["methods"]["warp"]["ms"]
 
 
 def test_importing_the_library_keeps_nothing(environment, tmp_path):

@@ -174,6 +174,7 @@ def test_prefetch_reads_overlapping_windows_once():
 
 
 @pytest.mark.parametrize("ahead, keep", [(1, 0), pytest.param(2, 6, marks=pytest.mark.slow), (4, 2)])
+@pytest.mark.slow
 def test_prefetch_in_bounded_memory(ahead, keep):
     sequence = Numbers(range(1000))
     for number, frame in prefetch(sequence, sequence.numbers, ahead=ahead, keep=keep):

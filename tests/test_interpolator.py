@@ -66,6 +66,7 @@ def test_the_warp_is_the_librarys():
     np.testing.assert_allclose(_warp(image, motion), jax.vmap(jx.backward_warp)(image, motion), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_frames_themselves_at_their_times(model):
     """For any weights; the size is no multiple of 4."""
     first, second = frames(9, 6)
@@ -110,7 +111,7 @@ def test_number_of_parameters():
 @pytest.mark.parametrize(
     "size, config",
     [
-        ((1, 1), SMALL),
+        pytest.param((1, 1), SMALL, marks=pytest.mark.slow),
         ((5, 3), SMALL),
         pytest.param((1, 1), InterpolatorConfig(), marks=pytest.mark.slow),
         pytest.param((1, 17), InterpolatorConfig(), marks=pytest.mark.slow),

@@ -309,7 +309,7 @@ def test_direct_is_a_network_with_the_histories_among_its_features():
     np.testing.assert_allclose(direct(x, mask, features, history), plain(x, mask, more, history), atol=1e-5)
 
 
-@pytest.mark.parametrize("direct", [False, True])
+@pytest.mark.parametrize("direct", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_contrast_is_a_network_that_is_shown_differences(direct):
     """The same weights; images but the first replaced by 3 (image - first), masks as they are."""
     size = {"widths": (3, 4), "features": 2, "histories": 2, "direct": direct}
@@ -356,6 +356,7 @@ def test_without_batch_norm_signals_keep_their_size():
     assert 0.005 < float(jnp.std(residual)) < 0.3
 
 
+@pytest.mark.slow
 def test_batches_and_mapping():
     """One frame = that frame in a batch = mapped; here of one pixel each."""
     model = extranet_from_torch(small_weights(), config=SMALL)

@@ -113,6 +113,7 @@ def test_numbers_change_without_compiling_anew():
     assert len(traces) == 2
 
 
+@pytest.mark.slow
 def test_options_are_swept_and_fitted():
     method = jx.load("guided_warp")
     history, target, truth = window()
@@ -136,18 +137,18 @@ def test_options_are_swept_and_fitted():
     [
         ("warp", {"filter": "nearest"}),
         ("occlusion_warp", {"by": "none"}),
-        ("occlusion_warp", {"floor": 0.9}),
+        pytest.param("occlusion_warp", {"floor": 0.9}, marks=pytest.mark.slow),
         ("occlusion_warp", {"margin": 50.0}),
         ("guided_warp", {"strides": (1, 2)}),
         ("guided_warp", {"sigma_guide": 1.0}),
         ("warp_3d", {"epsilon": 10.0}),
-        ("grid_extrapolate", {"cell": 16}),
+        pytest.param("grid_extrapolate", {"cell": 16}, marks=pytest.mark.slow),
         ("grid_extrapolate", {"tear": 100.0}),
         ("softmax_splat", {"by_depth": 0.0}),
-        ("grid_warp", {"cell": 16}),
+        pytest.param("grid_warp", {"cell": 16}, marks=pytest.mark.slow),
         ("bidirectional_image", {"iterations": 0, "starts": ("default",)}),
-        ("bidirectional_image", {"visibility": "inside"}),
-        ("bidirectional_guided", {"keep": 1}),
+        pytest.param("bidirectional_image", {"visibility": "inside"}, marks=pytest.mark.slow),
+        pytest.param("bidirectional_guided", {"keep": 1}, marks=pytest.mark.slow),
         ("dis", {"preset": "ultrafast"}),
     ],
 )
@@ -168,7 +169,9 @@ def test_options_count(name, options):
 
 
 @pytest.mark.parametrize("name", ["warp", "guided_warp"])
-@pytest.mark.parametrize(("dtype", "least"), [("float16", 60), ("bfloat16", 38), ("float32", 100)])
+@pytest.mark.parametrize(
+    ("dtype", "least"), [("float16", 60), pytest.param("bfloat16", 38, marks=pytest.mark.slow), ("float32", 100)]
+)
 def test_a_method_in_another_precision(name, dtype, least):
     """The error is that of the colours' own digits, once or twice; the image has the colours' dtype."""
     history, target, _ = window((32, 48))

@@ -42,6 +42,7 @@ def db(image, truth):
 # Runs
 
 
+@pytest.mark.slow
 def test_a_run_is_compiled_once():
     import jax._src.test_util as jtu
 
@@ -90,6 +91,7 @@ def test_light_that_changes_between_rendered_frames():
         assert db(lit[k], truth) > max(39, db(blended[k], truth) + 24)  # 40.6, 49.7, 42.3 against 14.7, 8.6, 14.7
 
 
+@pytest.mark.slow
 def test_other_lights_compile_nothing():
     import jax._src.test_util as jtu
 
@@ -116,6 +118,7 @@ def test_what_stands_still_stays_as_it_is():
     np.testing.assert_allclose(jx.motion_blur(*frames, shutter=1.0, samples=2), frames[1].color, rtol=2e-7)
 
 
+@pytest.mark.slow
 def test_whole_pixels_and_attributes():
     """Three parts of a shutter of 3/4: the frames made are 1/4 away, where all has moved by (2, -1) of (8, -4).
 
@@ -138,7 +141,10 @@ def test_whole_pixels_and_attributes():
     np.testing.assert_allclose(blurred[inside], expected[inside], atol=1e-6)
 
 
-@pytest.mark.parametrize("shutter, least", [(0.5, 41.0), (1.0, 42.0), (2.0, 45.0)])
+@pytest.mark.parametrize(
+    "shutter, least",
+    [(0.5, 41.0), pytest.param(1.0, 42.0, marks=pytest.mark.slow), pytest.param(2.0, 45.0, marks=pytest.mark.slow)],
+)
 def test_against_the_scene_averaged_over_the_shutter(shutter, least):
     """Rendered at the eleven times and averaged: 42.0, 43.0 and 46.0 dB; the rendered frame itself 34.2, 26.7, 17.0."""
     size, steps = (96, 121), 4
@@ -157,7 +163,7 @@ def bars():
     return first, jx.replace(second, forward_flow=flows[1]), jx.replace(third, color=third.color + jnp.float32(0.1))
 
 
-@pytest.mark.parametrize("assisted", [False, True])
+@pytest.mark.parametrize("assisted", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_bar_before_a_wall(assisted):
     """Half an interval before the bar is at 7..14, then at 10..17, half an interval after it at 13..20."""
     targets = None

@@ -214,6 +214,7 @@ def test_object_matrices_lead_to_the_frame_before(frame, before):
     assert np.median(error[rigid]) < 1e-2
 
 
+@pytest.mark.slow
 def test_motion_warps_the_frame_before_onto_this_one(scene, frame, before):
     seen = np.asarray(visible(scene, TIME, BEFORE, size=SIZE))
     there = np.rint(grid() + frame.motion).astype(int)
@@ -225,6 +226,7 @@ def test_motion_warps_the_frame_before_onto_this_one(scene, frame, before):
         assert (np.abs(now - then).max(-1) < limit)[check].mean() > 0.97, name  # half a pixel off at silhouettes
 
 
+@pytest.mark.slow
 def test_visible_agrees_with_a_depth_comparison(scene, frame, before):
     exact = np.asarray(visible(scene, TIME, BEFORE, size=SIZE))
     displacement = np.asarray(flow(scene, TIME, BEFORE, size=SIZE))
@@ -268,6 +270,7 @@ def test_normals(frame):
     assert ((estimate * n).sum(-1)[smooth] > 0.97).mean() > 0.99
 
 
+@pytest.mark.slow
 def test_shadow_is_what_dynamic_objects_block_of_the_sun(scene, frame):
     g = frame.gbuffer
     flat = lambda value: value.reshape(-1, value.shape[-1])  # noqa: E731
@@ -355,6 +358,7 @@ def test_times_seeds_and_objects_share_one_compilation(scene, frame):
 
 
 @pytest.mark.parametrize("size", [pytest.param((1, 1), marks=pytest.mark.slow), (1, 7)])
+@pytest.mark.slow
 def test_small_sizes(scene, size):
     assert flow(scene, 3.0, 1.0, size=size).shape == (*size, 3)
     assert visible(scene, 3.0, 1.0, size=size).shape == size

@@ -245,7 +245,8 @@ OPTIONAL = [(name, s.name) for name in jx.method_names() for s in jx.load(name).
 
 
 @pytest.mark.parametrize(
-    ("name", "left_out"), [pytest.param(*p, marks=pytest.mark.slow) if p[0] == "extranet" else p for p in OPTIONAL]
+    ("name", "left_out"),
+    [pytest.param(*p, marks=pytest.mark.slow) if p[0] in ("extranet", "bidirectional_guided") else p for p in OPTIONAL],
 )
 def test_any_optional_stage_may_be_left_out(name, left_out):
     """Never is light shown that was not multiplied by the reflectance again: that would be white."""

@@ -153,7 +153,7 @@ def test_the_answer_is_found(tmp_path):
     assert scores["negative"] > -1e-4
 
 
-@pytest.mark.parametrize("clip", [None, 0.5])
+@pytest.mark.parametrize("clip", [pytest.param(None, marks=pytest.mark.slow), 0.5])
 def test_clipping(clip):
     """With a huge epsilon Adam's first step is the learning rate times the gradient over epsilon."""
     optimizer = transformation(Optimizer(peak_learning_rate=1.0, constant=9, epsilon=1e4, clip=clip), 10)
@@ -219,6 +219,7 @@ def test_a_finished_run_only_exports(whole, tmp_path):
     assert (workdir / "metrics.jsonl").read_text() == before
 
 
+@pytest.mark.slow
 def test_a_run_begins_with_given_weights(whole, tmp_path):
     """From another run's model, as folder and as file; what is resumed does not look at them again."""
     _, workdir, _ = whole
@@ -293,6 +294,7 @@ def test_the_last_and_the_best_are_kept(tmp_path):
     np.testing.assert_array_equal(jax.random.key_data(state["key"]), [0, 4])
 
 
+@pytest.mark.slow
 def test_half_precision(tmp_path):
     """The network computes in bfloat16; weights, statistics and the optimiser's moments stay float32."""
     seen = []

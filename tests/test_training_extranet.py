@@ -86,7 +86,7 @@ def answer_of(model, made):
     return np.float64(nnx.jit(ExtraNet.__call__)(model, *(array[None] for array in given))[0])
 
 
-@pytest.mark.parametrize("space", ["log", "display"])
+@pytest.mark.parametrize("space", ["log", pytest.param("display", marks=pytest.mark.slow)])
 def test_the_loss_is_that_of_the_paper(space):
     """In float64: l1 + hole + the largest tenth, of what is no sky; display: after a tone curve of the image."""
     task, made = example(space=space)
@@ -113,7 +113,7 @@ def test_the_loss_is_that_of_the_paper(space):
     np.testing.assert_allclose(total, sum(expected.values()), rtol=2e-4)
 
 
-@pytest.mark.parametrize("space, margin", [("log", 0), ("display", 2)])
+@pytest.mark.parametrize("space, margin", [("log", 0), pytest.param("display", 2, marks=pytest.mark.slow)])
 def test_the_relative_loss_is_what_is_left_of_the_first_guess(space, margin):
     """Of all, and of holes once more."""
     task, made = example(space=space, loss="relative", hole_weight=0.5, hole_margin=margin)
@@ -178,6 +178,7 @@ def test_the_sky_has_no_gradient():
     assert np.abs(gradient[16:]).max() > 0
 
 
+@pytest.mark.slow
 def test_a_scene_without_albedo_or_sky():
     window = make_window()
 
@@ -201,6 +202,7 @@ def test_shipped_configurations():
 @pytest.mark.parametrize(
     ("task", "options"), [(ExtraNetTask, ExtraNetOptions), (InterpolatorTask, InterpolatorOptions)]
 )
+@pytest.mark.slow
 def test_dumps_of_another_size_are_refused(tmp_path, task, options):
     """Before anything is rendered, with what is to be set."""
     for time in range(8):

@@ -81,6 +81,7 @@ def test_a_method_without_truth_of_its_size_is_left_out():
     assert list(results.methods) == ["warp"]
 
 
+@pytest.mark.slow
 def test_scenes_of_two_sizes():
     sequence = SceneSequence("demo", frames=3, size=(18, 32), jittered=True, scale=2, larger_samples=4)
     frame, larger = sequence.frame(1), sequence.larger.frame(1)
@@ -106,6 +107,7 @@ def waves(x, y):
     return np.stack([np.sin(0.3 * x + 0.2 * y), np.cos(0.25 * x), np.sin(0.2 * y + 1)], -1).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_a_jittered_frame_is_fetched_where_its_samples_are():
     """Against the function that was sampled: pixel p of a frame shows p + jitter, and all moves by 1.5 a frame."""
     y, x = np.mgrid[0:24, 0:32].astype(np.float64)
@@ -126,7 +128,9 @@ def test_a_jittered_frame_is_fetched_where_its_samples_are():
     assert np.abs(unaware - frame(2).color)[4:-4, 6:-4].max() > 0.05
 
 
-@pytest.mark.parametrize("name", ["warp", "guided_warp", "bidirectional", "blend"])
+@pytest.mark.parametrize(
+    "name", ["warp", "guided_warp", pytest.param("bidirectional", marks=pytest.mark.slow), "blend"]
+)
 def test_methods_fetch_jittered_frames_where_their_samples_are(name):
     """A picture that stands still, sampled elsewhere each frame: what is generated lies on the target's pixels."""
     y, x = np.mgrid[0:24, 0:32].astype(np.float64)
