@@ -78,8 +78,8 @@ class Scan:
 
 def _spaced(items: Any, most: int) -> list:
     """At most so many of a list, evenly spaced from the first to the last."""
-    places = np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)) if items else []
-    return [items[i] for i in places]
+    indices = np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)) if items else []
+    return [items[i] for i in indices]
 
 
 def _scan(sequence: Sequence, bar) -> Scan:
@@ -143,7 +143,7 @@ class Trial:
     """The dB of warping a frame onto the next one.
 
     conventions: under each convention of the stored motion, best first; infinite where every pixel is met. still: of
-    the frame as it is, without any motion. one_number: where the numbering has a step, of vectors `step` times as long,
+    the frame before, without any motion. one_number: where the numbering has a step, of vectors `step` times as long,
     under the best convention: as if they led to the frame with the number before.
     """
 
@@ -176,8 +176,8 @@ def try_conventions(sequence: Sequence, bar) -> Trial | None:
         stored = jax.device_put(np.where(np.isfinite(stored), stored, 0).astype(np.float32))
 
         def error(motion, first=first, truth=truth, valid=valid) -> float:
-            made = np.asarray(display(backward_warp(first, motion), hdr=sequence.hdr))
-            return float(np.mean(np.square(made - truth, dtype=np.float64), where=valid))
+            warped = np.asarray(display(backward_warp(first, motion), hdr=sequence.hdr))
+            return float(np.mean(np.square(warped - truth, dtype=np.float64), where=valid))
 
         for convention in conventions():
             errors[convention].append(error(convert_motion(stored, **dataclasses.asdict(convention))))

@@ -55,7 +55,7 @@ class Input:
         text: the argument, for messages.
         name: of its folder of results, different for each input.
         open: its sequence; raises InputError where it cannot be used.
-        parts: how many parts of its path, at least, its name is made of: one, unless the last says nothing by itself.
+        parts: how many parts of its path, at least, its name consists of: one, unless the last says nothing by itself.
     """
 
     text: str
@@ -273,7 +273,8 @@ def open_methods(
     Tuples are written 1-3-5.
 
     Args:
-        names: the list. option: where it was given.
+        names: the list.
+        option: where it was given.
         weights: arguments NAME=FILE, for every mention of that method.
 
     Raises:
@@ -324,7 +325,7 @@ def open_metrics(names: str) -> dict[str, Metric]:
 
 
 def terminal(*, stderr: bool = False) -> Console:
-    """Where a command prints, as it is: brackets in a name are no markup."""
+    """Where a command prints, without markup: brackets in a name stay brackets."""
     return Console(stderr=stderr, markup=False)
 
 

@@ -137,8 +137,9 @@ class Evaluation:
             wrong = [n for n in chosen if n not in numbers]
             if wrong or not chosen:
                 raise InputError(
-                    f"--frames: {', '.join(map(str, wrong)) or 'none'} of {sequence.name} cannot be scored; with "
-                    f"{past} rendered frames of history these can: {', '.join(map(str, numbers))}"
+                    f"{{argument}}: {', '.join(map(str, wrong)) or 'none'} of {sequence.name} cannot be scored; with "
+                    f"{past} rendered frames of history these can: {', '.join(map(str, numbers))}",
+                    argument="frames",
                 )
             numbers = chosen
         return cls(sequence, usable, metrics, slots, tuple(numbers), factor, past, future, skipped, left_out)

@@ -129,7 +129,8 @@ def _without_gaps(sequence: FileSequence) -> FileSequence:
     if missing := gaps(sequence):
         first = missing[0]
         span = f"frame {first[0]}" if len(first) == 1 else f"frames {first[0]} to {first[-1]}"
-        raise InputError(f"{sequence.folder}: {span} missing; render what is missing, or read it without strict")
+        remedy = "render what is missing, or read it without {argument}"
+        raise InputError(f"{sequence.folder}: {span} missing; {remedy}", argument="strict")
     return sequence
 
 

@@ -94,7 +94,8 @@ class FileSequence(Sequence):
         if len(self._files) < len(files):
             self.notes += (f"frame {min(files)} left out: it has no motion vectors",)
         if strict and self.notes:
-            raise InputError(f"{self.folder}: {self.notes[0]}; remove or rename its files, or read it without strict")
+            remedy = "remove or rename its files, or read it without {argument}"
+            raise InputError(f"{self.folder}: {self.notes[0]}; {remedy}", argument="strict")
         self.numbers = tuple(self._files)
         self.step, found = find_step(self.folder, self.numbers, step)
         self.notes += (found,) if found else ()
@@ -300,8 +301,9 @@ class FileSequence(Sequence):
         if invalid is None:
             return
         if self.strict:
-            remedy = "render it again, or read it without strict"
-            raise InputError(f"{self.folder}: frame {number} has {count} non-finite pixels (or of alpha 0); {remedy}")
+            remedy = "render it again, or read it without {argument}"
+            text = f"frame {number} has {count} non-finite pixels (or of alpha 0); {remedy}"
+            raise InputError(f"{self.folder}: {text}", argument="strict")
         self._masks[number] = np.packbits(invalid)
         while len(self._masks) > _MASKS_KEPT:
             self._masks.popitem(last=False)
