@@ -271,7 +271,7 @@ def search_picture() -> Image.Image:
         labelled(shown(made.color), f"made, time 1/2: {decibels(made.color, truth)}"),
         labelled(shown(second.color), "rendered, time 1"),
         labelled(colors[case], "how each pixel was found"),
-        labelled(off(made.color, truth), "error of the frame made"),
+        labelled(off(made.color, truth), "error of the frame generated"),
         labelled(eight_bit(np.minimum(missed, 2)[..., None] / 2), "Correspondence.error: white = 2 pixels or more"),
     ]
     whole = sheet(tiles, 3)

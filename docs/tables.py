@@ -20,8 +20,9 @@ BLOCK = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end -->)", re.
 
 
 def read(path: str) -> Any:
-    """A JSON file of the repository."""
-    return json.loads((ROOT / path).read_text())
+    """A JSON file of the repository, or the lines of one that has a value a line."""
+    text = (ROOT / path).read_text()
+    return [json.loads(line) for line in text.splitlines()] if path.endswith(".jsonl") else json.loads(text)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -181,6 +182,127 @@ def reach() -> str:
     return table(["", *sizes], rows)
 
 
+_PARTS = {
+    "warp": "warp",
+    "occlusion_warp": "occlusion_warp",
+    "guided_warp": "guided_warp",
+    "first guess": "first guess",
+    "whole": "**whole**, our recipe",
+    "without histories": 'without histories (table 7, "w/o HE")',
+    "without occlusion motion": 'without occlusion motion ("w/o OMV")',
+    "the paper's loss": "the paper's loss",
+    "the paper's loss without shading": 'the paper\'s loss without shading ("w/o SL")',
+    "the paper's network and loss": "the paper's network and loss",
+    "full gates": "full gates (section 6.5)",
+    "GC": "full gates, no histories (GC)",
+    "histories by their encoder alone": "histories by their encoder alone",
+    "images as they are": "images themselves, not their differences",
+    "batch norm": "batch norm",
+    "errors in the log domain": "errors in the log domain",
+    "warp as first guess": "the plain warp as first guess",
+    "seen scenes": "seen scenes: without interior and dock",
+    "one scene": "one scene: walkers",
+}
+_TRAINED = list(_PARTS)[4:]
+
+
+def ablations() -> str:
+    """What each part of ExtraNet is worth, mean and standard deviation over seeds."""
+    found = read("experiments/results/ablations.json")
+
+    def cell(entry: dict[str, Any]) -> str:
+        spread = entry["spread"]
+        return f"{entry['mean']:.2f}" + ("" if spread is None else f" ± {spread:.2f}")
+
+    rows = []
+    for name, title in _PARTS.items():
+        seeds = str(len(found["dB by seed"][name])) if name in _TRAINED else ""
+        whole, unseen = found["all scenes"][name], found["on interior and dock"][name]["psnr"]
+        cells = [cell(whole[part]) for part in ("psnr", "hole", "shadow", "border")]
+        rows.append([title, seeds, *cells, cell(unseen)])
+    return table(["", "seeds", "whole", "hole", "shadow", "border", "unseen"], rows)
+
+
+def failures() -> str:
+    """Where ExtraNet fails: figure 21 of Guo et al. 2021 in numbers."""
+    found = read("experiments/results/failures.json")
+    border, edges, light = found["border"], found["shadow edges"], found["sudden light"]
+    rows = []
+    for name in light:
+        cells = [f"{border[step][name]:.2f}" for step in border]
+        cells += [f"{edges['psnr'][name]:.2f}", f"{edges['sharpness'][name]:.2f}"]
+        cells += [f"{light[name][key]:.2f}" for key in ("kept", "steady", "flash")]
+        rows.append([name, *cells])
+    steps = [f"step {float(step):g} ({100 * border[step]['share']:.1f} %)" for step in border]
+    steps[0] = f"border, {steps[0]}"
+    return table(["", *steps, "moved shadow", "its sharpness", "flash kept", "dB", "with flash"], rows)
+
+
+def curve() -> str:
+    """The validation gain of ExtraNet's three rounds of training, over its first guess."""
+    lines = [line for line in read("experiments/results/extranet_training.jsonl") if line["kind"] == "validation"]
+    steps = (1000, 2000, 3000, 4000, 6000, 8000, 10000, 12000, 14000)
+    rows = []
+    for number in sorted({line["round"] for line in lines}):
+        found = {line["step"]: line for line in lines if line["round"] == number}
+        gains = {
+            "whole": {step: line["gain"] for step, line in found.items()},
+            "holes": {step: line["psnr_hole"] - line["guess_hole"] for step, line in found.items()},
+        }
+        for part, by_step in gains.items():
+            rows.append([f"{number}: {part}", *(f"{by_step[s]:.2f}" if s in by_step else "" for s in steps)])
+    return table(["step", *map(str, steps)], rows)
+
+
+_BY_SIZE = {name: name for name in ("warp", "occlusion_warp", "guided_warp", "warp_3d", "grid_extrapolate")} | {
+    "extranet": "**extranet**",
+    "interpolator": "interpolator (both sides)",
+    "bidirectional": "bidirectional (both sides)",
+}
+
+
+def _ms(value: float) -> str:
+    return f"{value:.1f}" if value < 10 else f"{value:.0f}"
+
+
+def sizes() -> str:
+    """Error and time of methods by resolution."""
+    found = read("experiments/results/resolutions.json")
+    errors, times = found["errors"], found["times"]
+    rows = []
+    for name, title in _BY_SIZE.items():
+        decibels = [f"{errors[size][name]['psnr']:.2f}" for size in errors]
+        rows.append([title, *decibels, *(_ms(times[size]["whole"][name]) for size in errors)])
+    head = [f"{size}{unit if i == 0 else ''}" for unit in (" dB", " ms") for i, size in enumerate(errors)]
+    return table(["", *head], rows)
+
+
+_STAGES = {
+    "reproject three histories": ("reproject",),
+    "occlusion motion": ("occlusion motion",),
+    "hole masks": ("holes",),
+    "demodulate": ("demodulate",),
+    "warp": ("warp",),
+    "guided warp": ("guided warp",),
+    "the network's inputs": ("inputs",),
+    "network": ("network",),
+    "modulate, sky": ("modulate", "warped sky"),
+}
+_ALONE = {"*networks alone:* the paper's, light gates": "light gates", "full gates": "full gates"}
+_ALONE |= {"full gates, no histories (GC)": "full gates, no histories (GC)"}
+
+
+def stage_times() -> str:
+    """Milliseconds of ExtraNet's stages, and of its networks alone, by resolution."""
+    times = read("experiments/results/resolutions.json")["times"]
+    rows = [
+        [title, *(_ms(sum(found["extranet's stages"][name] for name in names)) for found in times.values())]
+        for title, names in _STAGES.items()
+    ]
+    rows += [[title, *(_ms(found["networks"][name]) for found in times.values())] for title, name in _ALONE.items()]
+    return table(["extranet by stage, ms", *times], rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "search": search,
     "stiff": stiff,
@@ -190,6 +312,11 @@ TABLES: dict[str, Callable[[], str]] = {
     "networks": networks,
     "scenes": scenes,
     "reach": reach,
+    "ablations": ablations,
+    "failures": failures,
+    "curve": curve,
+    "sizes": sizes,
+    "stage-times": stage_times,
 }
 
 

@@ -7,10 +7,28 @@ class InputError(Exception):
     """Input that cannot be used; the message is one line that names the file and the remedy.
 
     It can be printed whatever a file's name or content is (`printable`).
+
+    Args:
+        args: the message first.
+        argument: the argument that the message is about; "{argument}" in the message stands for its name, which is
+            `frames` in Python and `--frames` on the command line.
     """
 
-    def __init__(self, *args: object) -> None:
+    def __init__(self, *args: object, argument: str | None = None) -> None:
         super().__init__(*(printable(arg) if isinstance(arg, str) else arg for arg in args))
+        self.argument = argument
+
+    def __str__(self) -> str:
+        return self._said("")
+
+    @property
+    def on_command_line(self) -> str:
+        """The message to who gave the argument as an option of a command."""
+        return self._said("--")
+
+    def _said(self, prefix: str) -> str:
+        text = super().__str__()
+        return text if self.argument is None else text.replace("{argument}", prefix + self.argument)
 
 
 def printable(text: object) -> str:

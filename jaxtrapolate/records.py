@@ -1,7 +1,7 @@
 """The records that all functions and methods exchange: immutable pytrees, absent fields are `None`.
 
 Convention:
-    Images are `[H, W, C]`, channels last; batches are made by `vmap`. Coordinates are in pixels, x to the right and
+    Images are `[H, W, C]`, channels last; batches by `vmap`. Coordinates are in pixels, x to the right and
     y down, an integer is a pixel's centre. Motion is a displacement to add: the surface point at pixel p is at
     p + motion[p] in the other frame. Readers convert each file's own convention to this one, nothing else does.
 

@@ -109,11 +109,11 @@ def _causes(value: Any) -> dict[str, CauseScore]:
 
 @dataclasses.dataclass(frozen=True)
 class FrameScore:
-    """The scores of one generated frame.
+    """The scores of one generated frame, or of a rendered one that was super sampled.
 
     Attributes:
         number: of the frame.
-        distance: how many frames it is after the newest rendered one.
+        distance: how many frames it is after the newest rendered one; 0 for a rendered frame.
         psnr: over the whole frame.
         metrics: all others, by name; `None` where one could not be had.
         by_cause: PSNR by the cause of error.
@@ -157,14 +157,16 @@ class MethodResult:
     """The scores of one method.
 
     Attributes:
-        psnr: the mean over frames.
-        metrics: all others, by name, frames' means and those of clips.
-        ms: of a frame.
+        psnr: the mean over the generated frames.
+        metrics: all others, by name, generated frames' means and those of clips.
+        ms: of a generated frame.
         by_cause: PSNR by the cause of error: the mean over the frames in which it occurs, the share over all.
-        by_distance: PSNR by how many frames a frame is after the newest rendered one, where there are several.
+        by_distance: PSNR by how many frames a frame is after the newest rendered one, where there are several; 0 is
+            for the rendered frames, where the method super samples those.
         stages: milliseconds by stage, each on its own.
         left_out: what each stage that did not run lacks.
-        frames: the scores of single frames; none in results over several inputs.
+        frames: the scores of single generated frames; none in results over several inputs.
+        rendered: the scores of single rendered frames that were super sampled.
         inputs: over how many inputs the figures are means, in results over several.
     """
 
@@ -176,12 +178,13 @@ class MethodResult:
     stages: Mapping[str, RunTime] = dataclasses.field(default_factory=dict)
     left_out: Mapping[str, list[str]] = dataclasses.field(default_factory=dict)
     frames: tuple[FrameScore, ...] = ()
+    rendered: tuple[FrameScore, ...] = ()
     inputs: int | None = None
 
     @property
     def drift(self) -> float | None:
         """What the last of several frames in a row is below the first, in dB; `None` for single frames."""
-        known = [v for _, v in sorted(self.by_distance.items()) if v is not None]
+        known = [v for distance, v in sorted(self.by_distance.items()) if distance and v is not None]
         return known[0] - known[-1] if len(known) > 1 else None
 
     def to_json(self) -> dict[str, Any]:
@@ -194,13 +197,18 @@ class MethodResult:
             return found | {"inputs": self.inputs}
         found["stages"] = {k: v.to_json() for k, v in self.stages.items()}
         found["left_out"] = dict(self.left_out)
-        return found | {"frames": [f.to_json() for f in self.frames]}
+        found["frames"] = [f.to_json() for f in self.frames]
+        return found | ({"rendered": [f.to_json() for f in self.rendered]} if self.rendered else {})
 
     @classmethod
     def from_json(cls, value: Any, metrics: Any = ("ssim",)) -> "MethodResult":
         entry = mapping(value)
         left_out = mapping(entry.get("left_out")).items()
-        frames = (FrameScore.from_json(f, metrics) for f in items(entry.get("frames")))
+
+        def frames(key: str) -> tuple[FrameScore, ...]:
+            found = (FrameScore.from_json(f, metrics) for f in items(entry.get(key)))
+            return tuple(sorted((f for f in found if f is not None), key=lambda f: f.number))
+
         distances = ((number(k), number(v)) for k, v in mapping(entry.get("by_distance")).items())
         inputs = number(entry.get("inputs"))
         return cls(
@@ -211,7 +219,8 @@ class MethodResult:
             by_distance={int(k): v for k, v in distances if k is not None and math.isfinite(k)},
             stages={str(k): RunTime.from_json(v) for k, v in mapping(entry.get("stages")).items()},
             left_out={str(k): [str(i) for i in (v if isinstance(v, (list, tuple)) else [v])] for k, v in left_out},
-            frames=tuple(sorted((f for f in frames if f is not None), key=lambda f: f.number)),
+            frames=frames("frames"),
+            rendered=frames("rendered"),
             inputs=None if inputs is None or not math.isfinite(inputs) else int(inputs),
         )
 
@@ -239,8 +248,8 @@ class InputResult:
     skipped: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        kept = ("inputs", "stages", "left_out", "frames")
-        methods = {n: {k: v for k, v in m.to_json().items() if k not in kept} for n, m in self.methods.items()}
+        left = ("inputs", "stages", "left_out", "frames", "rendered")
+        methods = {n: {k: v for k, v in m.to_json().items() if k not in left} for n, m in self.methods.items()}
         size = None if self.size is None else list(self.size)
         found = {"input": self.input, "folder": self.folder, "size": size, "hdr": self.hdr, "frames": self.frames}
         return found | {"methods": methods, "skipped": dict(self.skipped)}

@@ -11,7 +11,8 @@ import jaxtrapolate as jx
 from jaxtrapolate.commands.inputs import terminal
 from jaxtrapolate.commands.main import main
 from jaxtrapolate.commands.tables import print_table
-from jaxtrapolate.files import read_exr, read_png, write_png, write_unreal_frame
+from jaxtrapolate.errors import InputError
+from jaxtrapolate.files import open_sequence, read_exr, read_png, write_png, write_unreal_frame
 from jaxtrapolate.files.packed import encode_motion
 from jaxtrapolate.results import Results
 
@@ -262,7 +263,10 @@ def test_gaps_and_non_finite_pixels(capsys, tmp_path):
     assert any("gap" in n for n in results["notes"])
     assert any("1 non-finite pixels" in n for n in results["notes"])
     assert "gap: frame 4 is missing" in run(capsys, "check", tmp_path)[1]
-    assert "gap" in fails(capsys, "check", tmp_path, "--strict")
+    said = fails(capsys, "check", tmp_path, "--strict")
+    assert "frame 4 missing; render what is missing, or read it without --strict" in said
+    with pytest.raises(InputError, match=r"or read it without strict$"):
+        open_sequence(tmp_path, strict=True)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

@@ -89,7 +89,7 @@ def test_generate_writes_damaged_frames_again(capsys, still_dump, tmp_path):
     (tmp_path / "0002.5.exr").write_bytes(whole[: len(whole) // 2])
     write_exr(tmp_path / "0003.5.exr", np.zeros((4, 4, 3), np.float32))
     _, _, err = run(capsys, *common)
-    assert "3 frames made with warp" in err
+    assert "3 frames generated with warp" in err
     assert "3 were there already" in err
     for name, image in first.items():
         np.testing.assert_array_equal(color(tmp_path / name), image)
@@ -105,7 +105,7 @@ def test_generate_knows_its_input(capsys, dump, tmp_path):
     dumped(dump, [3])
     code, _, err = run(capsys, *common)
     assert code == 0
-    assert "1 frames made with warp" in err
+    assert "1 frames generated with warp" in err
 
 
 def test_render_never_mixes_seeds(capsys, tmp_path, monkeypatch):
@@ -219,7 +219,7 @@ def test_no_interpolation_across_a_gap(capsys, tmp_path):
     dumped(folder, (2,))
     code, _, err = run(capsys, *arguments, "bidirectional_image", "--fresh")
     assert code == 0
-    assert "1 frames made" in err
+    assert "1 frames generated" in err
 
 
 def test_methods_that_cannot_run_are_named(capsys, tmp_path):

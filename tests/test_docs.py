@@ -131,21 +131,35 @@ def public_names():
     return names
 
 
-def test_arguments_that_are_described_exist():
-    """What a docstring calls an argument is one; several may share a line, as in "first, second: two images"."""
+def documented(path):
+    """Names, arguments and sections Args of a module's functions and of its classes (`__init__`)."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if not isinstance(node, ast.FunctionDef | ast.ClassDef):
+            continue
+        section = re.search(r"^Args:\n(.*?)(?:\n\n|\Z)", ast.get_docstring(node) or "", re.DOTALL | re.MULTILINE)
+        taking = [n for n in getattr(node, "body", ()) if isinstance(n, ast.FunctionDef) and n.name == "__init__"]
+        function = node if isinstance(node, ast.FunctionDef) else next(iter(taking), None)
+        if section is not None:
+            assert function is not None, f"{path.name}, {node.name}: has no arguments"
+            yield node.name, function.args, section[1]
+
+
+def test_each_argument_has_a_line_of_its_own():
+    """Where a docstring has a section Args, it says something of each argument, one a line, and of no other."""
+    seen = 0
     for path in sorted((ROOT / "jaxtrapolate").rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if not isinstance(node, ast.FunctionDef):
-                continue
-            section = re.search(r"\n( *)Args:\n(.*?)(?:\n\n|\Z)", ast.get_docstring(node, clean=True) or "", re.DOTALL)
-            if section is None:
-                continue
-            arguments = node.args
-            known = {a.arg for a in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs)}
-            known |= {a.arg for a in (arguments.vararg, arguments.kwarg) if a is not None}
-            described = re.findall(rf"^{section[1]} {{4}}\*{{0,2}}(\w+(?:, \w+)*): ", section[2], re.MULTILINE)
-            for name in ", ".join(described).split(", "):
-                assert name in known, f"{path.name}, {node.name}: {name}"
+        for name, arguments, section in documented(path):
+            listed = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, arguments.vararg)
+            known = {a.arg for a in listed if a} - {"self", "cls"}
+            options = {arguments.kwarg.arg} if arguments.kwarg else set()
+            described = re.findall(r"^ {4}\*{0,2}(\w[\w, ]*): ", section, re.MULTILINE)
+            where = f"{path.name}, {name}"
+            assert known <= set(described), f"{where}: says nothing of {known - set(described)}"
+            assert set(described) <= known | options, f"{where}: has no arguments {set(described) - known - options}"
+            inside = [a for a in known if re.search(rf"[.;] {a}: ", section)]
+            assert not inside, f"{where}: no lines of their own for {inside}"
+            seen += 1
+    assert seen > 100
 
 
 class Resources(html.parser.HTMLParser):

@@ -51,7 +51,8 @@ def test_equal_settings_go_on_and_others_are_refused(tmp_path):
         used(tmp_path / "out", {"method": "guided_warp", "factor": 3, "weights": None})
     text = str(error.value)
     assert 'method was "warp", is now "guided_warp"; factor was 2, is now 3' in text
-    assert "--fresh" in text
+    assert "start anew with fresh, which" in text
+    assert "start anew with --fresh, which" in error.value.on_command_line
     assert "\n" not in text
     with pytest.raises(InputError, match='command was "generate", is now "render"'):
         used(tmp_path / "out", {"method": "warp", "factor": 2, "weights": None}, command="render")
@@ -102,7 +103,7 @@ def test_files_that_no_record_explains_are_not_touched(tmp_path):
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"settings": 1, "code": "", "parts": {}}', "[" * 100_000])
 def test_a_damaged_record(tmp_path, content):
     (tmp_path / RECORD).write_text(content)
-    with pytest.raises(InputError, match="damaged; choose another folder, or start anew with --fresh"):
+    with pytest.raises(InputError, match="damaged; choose another folder, or start anew with fresh"):
         used(tmp_path)
     used(tmp_path, fresh=True)
 

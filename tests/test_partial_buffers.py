@@ -144,7 +144,7 @@ def test_flows_are_turned_around_without_the_depth_of_one_frame():
 
 
 @pytest.mark.parametrize(
-    "colored, place, options, history, future",
+    "colored, index, options, history, future",
     [
         ("x...x", 1, {"future": 1}, [0], [2, 3, 4]),
         ("x...x", 2, {"future": 1}, [0, 1], [3, 4]),
@@ -159,22 +159,22 @@ def test_flows_are_turned_around_without_the_depth_of_one_frame():
         ("x.x", 1, {"future": 1, "numbers": [4, 4.5, 5]}, [0], [2]),
     ],
 )
-def test_neighbours(colored, place, options, history, future):
-    found = neighbours([c == "x" for c in colored], place, **options)
+def test_neighbours(colored, index, options, history, future):
+    found = neighbours([c == "x" for c in colored], index, **options)
     assert [list(r) for r in found] == [history, future]
 
 
 @pytest.mark.parametrize(
-    "place, numbers, message",
+    "index, numbers, message",
     [
-        (3, None, "place: expected 0 to 2, got 3"),
+        (3, None, "index: expected 0 to 2, got 3"),
         (1, [0, 1], "numbers: expected 3 as there are frames, got 2"),
         (1, [0, 1, 1], "numbers: expected each above the one before"),
     ],
 )
-def test_neighbours_that_are_none(place, numbers, message):
+def test_neighbours_that_are_none(index, numbers, message):
     with pytest.raises(ValueError, match=message):
-        neighbours([True, False, True], place, numbers=numbers)
+        neighbours([True, False, True], index, numbers=numbers)
 
 
 def test_several_missing_in_a_row_are_made_along_the_whole_motion():

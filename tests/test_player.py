@@ -1,6 +1,7 @@
 """The player: schedules, windows, memory threaded through a sequence, each frame generated once."""
 
 import json
+import pickle
 from fractions import Fraction
 
 import jax
@@ -236,8 +237,10 @@ def test_evaluation_as_a_function():
     assert restored == results
     with pytest.raises(ValueError, match="method: expected one of"):
         jx.evaluate(sequence, ["wrap"])
-    with pytest.raises(jx.InputError, match="frames: 2 of"):
+    with pytest.raises(jx.InputError, match=r"^frames: 2 of") as error:
         jx.evaluate(sequence, ["warp"], frames=[2])
+    assert error.value.on_command_line.startswith("--frames: 2 of ")
+    assert str(pickle.loads(pickle.dumps(error.value))) == str(error.value)
 
 
 def test_exact_and_unknown_figures_survive_json(tmp_path):

@@ -129,7 +129,7 @@ def test_the_best_method_that_can_is_taken(capsys, tmp_path, monkeypatch):
         frame = jx.Frame(frame.color if time % 2 == 0 else None, motion=frame.motion)
         write_unreal_frame(folder, "A", time, frame)
     assert main(["generate", str(folder), "--output", str(tmp_path / "o")]) == 0
-    assert "2 frames made with warp" in capsys.readouterr().err
+    assert "2 frames generated with warp" in capsys.readouterr().err
     monkeypatch.setattr(generate, "BEST_FIRST", ("bidirectional", "guided_warp"))
     assert main(["generate", str(folder), "--output", str(tmp_path / "p")]) == 2
     assert "no method can run: bidirectional: no rendered frame follows" in capsys.readouterr().err

@@ -1,22 +1,28 @@
 """Frames of two sizes, jittered ones, and cuts: what methods that super sample are handed and compared with."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles import look, perspective
+from rich.console import Console
 from synthetic import SyntheticSequence, make_frame, make_keyframe
 
 import jaxtrapolate as jx
 from jaxtrapolate.commands.evaluate import Request, evaluate_into
+from jaxtrapolate.commands.tables import print_table
 from jaxtrapolate.errors import InputError
 from jaxtrapolate.evaluation.evaluate import Evaluation
 from jaxtrapolate.evaluation.pictures import Gallery
 from jaxtrapolate.evaluation.schedule import held_back_slots
+from jaxtrapolate.evaluation.score import mean_over_inputs
 from jaxtrapolate.evaluation.windows import arguments, windows
 from jaxtrapolate.files import open_sequence, read_png, runs, write_exr, write_unreal_frame
 from jaxtrapolate.methods import Method, Stage
 from jaxtrapolate.ops.jitter import on_own_pixels, shift_camera
+from jaxtrapolate.results import Results
 from jaxtrapolate.scenes import SceneSequence
 from jaxtrapolate.scenes.sequence import jitter_of
 
@@ -73,6 +79,51 @@ def test_scores_causes_and_pictures_at_output_size(tmp_path):
     assert any("scored at the size of its own output: 48x32 and 96x64" in note for note in results.notes)
     alone = jx.evaluate(SyntheticSequence(range(8), SIZE), ["warp"])
     assert alone.methods["warp"].psnr == pytest.approx(results.methods["warp"].psnr, abs=1e-5)
+
+
+def test_rendered_frames_of_a_method_that_super_samples_are_scored_apart(tmp_path, capsys):
+    sequence, calls = Pair(), []
+
+    def counted(state, values):
+        calls.append(1)
+        return again(state, values)
+
+    stage = Stage("again", counted, ("target",), ("image",), past=0, on="rendered", host=True)
+    method = Method("twice", (twice().stages[0], stage), scale=2)
+    request = Request({"twice": method, "warp": jx.load("warp")}, pictures=1)
+    results = evaluate_into(sequence, request, tmp_path / "out", step=lambda *_: None)
+    found, alone = results.methods["twice"], jx.evaluate(Pair(), {"warp": jx.load("warp")}).methods["warp"]
+    assert [(f.number, f.distance) for f in found.rendered] == [(2, 0), (4, 0), (6, 0)]
+    for frame in found.rendered:
+        image = make_frame(frame.number, SIZE).color.repeat(2, 0).repeat(2, 1)
+        truth = make_frame(frame.number, (64, 96), fog=0.3).color
+        expected = float(jx.psnr(jx.tonemap(image), jx.tonemap(truth)))
+        assert frame.psnr == pytest.approx(expected, abs=1e-4)
+        assert sum(c.share for c in frame.by_cause.values()) == pytest.approx(1)
+    assert [f.number for f in found.frames] == [1, 3, 5, 7]
+    assert found.psnr == pytest.approx(np.mean([f.psnr for f in found.frames]))
+    assert found.by_distance == pytest.approx({0: np.mean([f.psnr for f in found.rendered]), 1: found.psnr})
+    assert found.drift is None
+    assert results.methods["warp"].rendered == ()
+    assert results.methods["warp"].psnr == pytest.approx(alone.psnr)
+    assert any("twice: rendered frames are super sampled too" in note for note in results.notes)
+    assert Results.from_json(json.loads(json.dumps(results.to_json()))) == results
+    count = len(calls)
+    again_results = evaluate_into(sequence, request, tmp_path / "out", step=lambda *_: None)
+    assert len(calls) == count
+    assert again_results.methods["twice"].rendered == found.rendered
+    print_table(results, Console(width=200))
+    assert "rendered" in capsys.readouterr().out
+    over = mean_over_inputs([results.methods, results.methods])
+    assert over["twice"].by_distance == pytest.approx(found.by_distance)
+    assert over["warp"].by_distance == {}
+    assert jx.evaluate(sequence, {"twice": twice()}, frames=[3]).methods["twice"].rendered == ()
+
+
+def test_a_method_that_cannot_super_sample_these_frames_is_left_out():
+    stage = Stage("again", again, ("target",), ("image",), reads=("target.sky",), past=0, on="rendered")
+    methods = {"twice": Method("twice", (twice().stages[0], stage), scale=2), "warp": jx.load("warp")}
+    assert "missing target.sky" in jx.evaluate(Pair(), methods).skipped["twice"]
 
 
 def test_a_method_without_truth_of_its_size_is_left_out():

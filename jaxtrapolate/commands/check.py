@@ -19,6 +19,7 @@ from jaxtrapolate.files import SETTINGS_NAME, MotionConvention, Sequence, gaps, 
 from jaxtrapolate.methods import method_names
 from jaxtrapolate.methods.frames import buffer
 from jaxtrapolate.ops.ego_motion import camera_matrix, off_camera, static_ids
+from jaxtrapolate.ops.jitter import shift_motion
 from jaxtrapolate.ops.motion import convert_motion
 from jaxtrapolate.ops.warp import backward_warp
 from jaxtrapolate.records import CHANNELS, Frame, Sign, Units, YAxis
@@ -63,7 +64,7 @@ class Scan:
     numbers: of these frames. buffers: by name, shape, range, and in how many frames. nonfinite: such pixels, by frame.
     no_depth: pixels without depth by frame, by why. ids: for each object, in which frames it moves as the camera does;
     None where that cannot be told. watched: the frames in which the camera's motion was found. farthest: the largest
-    depth of frames in which many pixels have it. colors: how many of all frames have colour.
+    depth of frames in which many pixels have it. colors: how many of all frames have colour. jitter: of those that say.
     """
 
     numbers: list[int]
@@ -74,12 +75,13 @@ class Scan:
     watched: list[int] = dataclasses.field(default_factory=list)
     farthest: dict[float, list[int]] = dataclasses.field(default_factory=dict)
     colors: int = 0
+    jitter: list[np.ndarray] = dataclasses.field(default_factory=list)
 
 
 def _spaced(items: Any, most: int) -> list:
     """At most so many of a list, evenly spaced from the first to the last."""
-    places = np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)) if items else []
-    return [items[i] for i in places]
+    indices = np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)) if items else []
+    return [items[i] for i in indices]
 
 
 def _scan(sequence: Sequence, bar) -> Scan:
@@ -102,6 +104,8 @@ def _scan(sequence: Sequence, bar) -> Scan:
             entry["frames"] += 1
             if name == "depth" and np.count_nonzero(value == high) > _PLATEAU * value.size:
                 scan.farthest.setdefault(high, []).append(number)
+        if frame.jitter is not None:
+            scan.jitter.append(np.asarray(frame.jitter))
         if bad := sequence.nonfinite(number):
             scan.nonfinite[number] = bad
         if none := sequence.no_depth(number):
@@ -143,7 +147,7 @@ class Trial:
     """The dB of warping a frame onto the next one.
 
     conventions: under each convention of the stored motion, best first; infinite where every pixel is met. still: of
-    the frame as it is, without any motion. one_number: where the numbering has a step, of vectors `step` times as long,
+    the frame before, without any motion. one_number: where the numbering has a step, of vectors `step` times as long,
     under the best convention: as if they led to the frame with the number before.
     """
 
@@ -163,7 +167,8 @@ def try_conventions(sequence: Sequence, bar) -> Trial | None:
     best = None
     for earlier, later in bar.track(_spaced(pairs, _PAIRS), description="try conventions"):
         stored = sequence.stored_motion(later)
-        first, second = sequence.frame(earlier).color, sequence.frame(later).color
+        newer, older = sequence.frame(later), sequence.frame(earlier)
+        first, second = older.color, newer.color
         if stored is None or first is None or second is None:
             continue
         valid = np.isfinite(stored).all(-1, keepdims=True)
@@ -175,9 +180,9 @@ def try_conventions(sequence: Sequence, bar) -> Trial | None:
         first, truth = jax.device_put(first), np.asarray(display(second, hdr=sequence.hdr))
         stored = jax.device_put(np.where(np.isfinite(stored), stored, 0).astype(np.float32))
 
-        def error(motion, first=first, truth=truth, valid=valid) -> float:
-            made = np.asarray(display(backward_warp(first, motion), hdr=sequence.hdr))
-            return float(np.mean(np.square(made - truth, dtype=np.float64), where=valid))
+        def error(motion, first=first, truth=truth, valid=valid, frames=(newer, older)) -> float:
+            warped = np.asarray(display(backward_warp(first, shift_motion(motion, *frames)), hdr=sequence.hdr))
+            return float(np.mean(np.square(warped - truth, dtype=np.float64), where=valid))
 
         for convention in conventions():
             errors[convention].append(error(convert_motion(stored, **dataclasses.asdict(convention))))
@@ -227,6 +232,10 @@ def _print_summary(sequence: Sequence, scan: Scan, out: Console) -> None:
         out.print(f"non-finite pixels, treated as holes, in frames: {listed}{more}", soft_wrap=True)
     else:
         out.print("no non-finite pixels in the frames read")
+    if scan.jitter:
+        low, high, count = np.min(scan.jitter), np.max(scan.jitter), len(scan.jitter)
+        text = f"{low:.3g} to {high:.3g} pixels, in {count} of {len(scan.numbers)} frames read"
+        out.print(f"jitter: {text}", soft_wrap=True)
     _print_no_depth(sequence, scan, out)
     for note in sequence.notes:
         out.print(f"note: {note}", soft_wrap=True)

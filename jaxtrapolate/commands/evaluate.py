@@ -80,6 +80,9 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run)
 
 
+_OF_INPUTS = ("motion", "strict", "size", "length", "scale", "jitter")
+
+
 @dataclasses.dataclass(frozen=True)
 class Request:
     """What is asked of each input.
@@ -128,7 +131,7 @@ def run(options: argparse.Namespace) -> int:
     named = options.methods is not None
     methods, unavailable = open_methods(options.methods if named else method_names(), weights=options.weights)
     metrics = open_metrics(options.metrics)
-    inputs = named_inputs(options.inputs, **{n: getattr(options, n) for n in ("motion", "strict", "size", "length")})
+    inputs = named_inputs(options.inputs, **{n: getattr(options, n) for n in _OF_INPUTS})
     if options.pictures < 0:
         raise InputError(f"--pictures: expected 0 or more, got {options.pictures}")
     video = Video.parse(options.video, fps=options.fps, several=len(inputs) > 1)

@@ -198,20 +198,21 @@ def run(options: argparse.Namespace) -> None:
                 bar.advance(task)
         if not generated + kept:
             causes = "; ".join(f"{count}: {reason}" for reason, count in reasons.items())
-            raise InputError(f"{sequence.name}: no frame can be made with {method.name} ({causes or 'too few frames'})")
+            text = f"no frame can be generated with {method.name} ({causes or 'too few frames'})"
+            raise InputError(f"{sequence.name}: {text}")
         summary = {
             "version": __version__,
             "input": sequence.name,
             "method": method.name,
             "frames": len(targets),
-            "made": generated,
+            "generated": generated,
             "kept from an earlier run": kept,
             "left out": reasons,
             "how": work.how,
             "notes": list(sequence.notes),
         }
         write_json(output.folder / "generate.json", summary)
-    text = f"{generated} frames made with {method.name}, {work.how}; in {output.folder}"
+    text = f"{generated} frames generated with {method.name}, {work.how}; in {output.folder}"
     text += f"; {kept} were there already" if kept else ""
     text += "".join(f"; {count} left out: {reason}" for reason, count in reasons.items())
     console.print(text, soft_wrap=True, highlight=False)

@@ -20,7 +20,7 @@ def add_parser(subparsers: Any) -> None:
     """Adds the command to the command line."""
     parser = subparsers.add_parser(
         "import-weights",
-        help="a PyTorch checkpoint of ExtraNet, or what `train` has made, as a file of weights",
+        help="a PyTorch checkpoint of ExtraNet, or what `train` has written, as a file of weights",
         description="Reads the authors' checkpoint of ExtraNet without PyTorch and without running anything in it, or "
         "the model that `jaxtrapolate train` left in its workdir, and writes its weights with all that the method is "
         "built with. Mind the licence of the file.",
@@ -34,7 +34,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--half", action="store_true", help="kept in float16: a file half as large; a file holds at most 2 MB"
     )
-    parser.add_argument("--note", metavar="TEXT", help="a line that is kept in the file: how they were made")
+    parser.add_argument("--note", metavar="TEXT", help="a line that is kept in the file: how they were trained")
     parser.set_defaults(run=run)
 
 

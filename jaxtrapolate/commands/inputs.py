@@ -35,6 +35,17 @@ def add_input(parser: argparse.ArgumentParser, *, several: bool = False) -> None
         parser.add_argument("inputs", nargs="+", metavar="INPUT", help=text)
         parser.add_argument("--size", metavar="WxH", help="of embedded scenes, width and height in pixels (320x180)")
         parser.add_argument("--length", type=int, metavar="N", help="of embedded scenes, how many frames (60)")
+        parser.add_argument(
+            "--scale",
+            type=int,
+            metavar="N",
+            help="of embedded scenes: the truth is rendered N times as large as well, for methods that super sample",
+        )
+        parser.add_argument(
+            "--jitter",
+            action="store_true",
+            help="of embedded scenes: each frame's samples are shifted by another fraction of a pixel",
+        )
     else:
         text = f"a folder of frames, or {SCENES}NAME[:SEED] for an embedded scene"
         parser.add_argument("input", metavar="INPUT", help=text)
@@ -55,7 +66,7 @@ class Input:
         text: the argument, for messages.
         name: of its folder of results, different for each input.
         open: its sequence; raises InputError where it cannot be used.
-        parts: how many parts of its path, at least, its name is made of: one, unless the last says nothing by itself.
+        parts: how many parts of its path, at least, its name consists of: one, unless the last says nothing by itself.
     """
 
     text: str
@@ -79,19 +90,37 @@ def named_inputs(
     strict: bool = False,
     size: str | None = None,
     length: int | None = None,
+    scale: int | None = None,
+    jitter: bool = False,
 ) -> list[Input]:
     """What INPUT arguments name, each input once; none is opened yet.
 
+    Args:
+        texts: the arguments.
+        motion: how folders state their motion vectors.
+        strict: whether folders with gaps or pixels that are not finite are refused.
+        size: of embedded scenes, "WxH".
+        length: of embedded scenes, how many frames.
+        scale: of embedded scenes, how many times as large the truth is rendered as well.
+        jitter: whether the samples of embedded scenes are shifted, each frame's by another fraction of a pixel.
+
     Raises:
-        InputError: size or length that cannot be, or for folders, which have their own.
+        InputError: size, length or scale that cannot be; or any of these for folders, which have their own.
     """
     scenes = {}
     if size is not None:
         scenes["size"] = parse_size(size)
     if length is not None:
         scenes["frames"] = check_count("--length", length)
+    if scale is not None:
+        if not 1 <= scale <= LARGEST_SCALE:
+            raise InputError(f"--scale: expected a number from 1 to {LARGEST_SCALE}, got {scale}")
+        scenes["scale"] = scale
+    if jitter:
+        scenes["jittered"] = True
     if scenes and not any(t.startswith(SCENES) for t in texts):
-        raise InputError(f"--size, --length: are for embedded scenes ({SCENES}NAME); a folder has its own")
+        given = "--size, --length, --scale, --jitter"
+        raise InputError(f"{given}: are for embedded scenes ({SCENES}NAME); a folder has its own")
     found: dict[object, Input] = {}
     for text in texts:
         if text.startswith(SCENES):
@@ -168,7 +197,7 @@ def _named_apart(inputs: list[Input]) -> list[Input]:
     return result
 
 
-MOST_FRAMES, LARGEST_SIDE, MOST_PIXELS = 1_000_000, 32768, 1 << 28
+MOST_FRAMES, LARGEST_SIDE, MOST_PIXELS, LARGEST_SCALE = 1_000_000, 32768, 1 << 28, 8
 """Of embedded scenes: far beyond what can be rendered, and short of what overflows."""
 
 
@@ -273,7 +302,8 @@ def open_methods(
     Tuples are written 1-3-5.
 
     Args:
-        names: the list. option: where it was given.
+        names: the list.
+        option: where it was given.
         weights: arguments NAME=FILE, for every mention of that method.
 
     Raises:
@@ -324,7 +354,7 @@ def open_metrics(names: str) -> dict[str, Metric]:
 
 
 def terminal(*, stderr: bool = False) -> Console:
-    """Where a command prints, as it is: brackets in a name are no markup."""
+    """Where a command prints, without markup: brackets in a name stay brackets."""
     return Console(stderr=stderr, markup=False)
 
 

@@ -18,7 +18,7 @@ def parser() -> argparse.ArgumentParser:
 
     top = argparse.ArgumentParser(
         prog="jaxtrapolate",
-        description="Make the frames between rendered frames, and say how good and how fast that is.",
+        description="Generate the frames between rendered frames, and say how good and how fast that is.",
     )
     top.add_argument("--version", action="version", version=f"jaxtrapolate {__version__}")
     top.add_argument(
@@ -64,7 +64,7 @@ def _run(options: argparse.Namespace) -> int:
         sys.stdout.flush()
         return status
     except InputError as error:
-        return _fail(str(error))
+        return _fail(error.on_command_line)
     except BrokenPipeError:
         _give_up_stdout()
         return 141

@@ -58,7 +58,7 @@ def _each(
             results = evaluate(entry.open(), folder=folder / entry.name, reuse=True, step=follow)
             done[entry.name] = (_summary(entry.name, results), results)
         except InputError as error:
-            reason = " ".join(str(error).split())
+            reason = " ".join(error.on_command_line.split())
             failed[entry.text] = (
                 reason if reason.startswith(entry.text.removesuffix(":0")) else f"{entry.text}: {reason}"
             )

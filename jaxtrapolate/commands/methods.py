@@ -5,8 +5,9 @@ from typing import Any
 
 from rich.table import Table
 
-from jaxtrapolate.commands.inputs import terminal
+from jaxtrapolate.commands.inputs import parse_size, progress, terminal
 from jaxtrapolate.errors import InputError
+from jaxtrapolate.evaluation.times import MethodTimes, keep_times, kept_times, measure_methods
 from jaxtrapolate.methods import Method, Stage, load, method_description, method_names
 from jaxtrapolate.methods.options import written
 
@@ -20,29 +21,45 @@ def add_parser(subparsers: Any) -> None:
         "stages: what each reads, and which are left out where that is missing.",
     )
     parser.add_argument("name", nargs="?", metavar="NAME", help=f"of {', '.join(method_names())}")
+    parser.add_argument(
+        "--measure",
+        action="store_true",
+        help="time the methods, or the one that is named, on this machine, on a frame of an embedded scene; the times "
+        "are kept in the user's cache folder and shown from then on",
+    )
+    parser.add_argument("--size", metavar="WxH", help="with --measure: width and height in pixels (1280x720)")
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> None:
     """Runs the command."""
     out = terminal()
+    if options.size is not None and not options.measure:
+        raise InputError("--size: is of the frames that --measure times; give both")
+    if options.name is not None and options.name not in method_names():
+        raise InputError(f"no method {options.name!r}; there are {', '.join(method_names())}")
+    if options.measure:
+        _measure([options.name] if options.name else list(method_names()), parse_size(options.size or "1280x720"))
+    times = kept_times()
     if options.name is None:
         table = Table()
-        for column in ("method", "kind", "frames", "what it does"):
-            table.add_column(column, no_wrap=column != "what it does")
+        for column in ("method", "kind", "frames", *(["ms"] if times else []), "what it does"):
+            table.add_column(column, no_wrap=column != "what it does", justify="right" if column == "ms" else "left")
         for name in method_names():
             method, text = _loaded(name)
-            table.add_row(name, "" if method is None else method.kind, "" if method is None else _frames(method), text)
+            facts = ("", "") if method is None else (method.kind, _frames(method))
+            table.add_row(name, *facts, *([_ms(times, name)] if times else []), text)
         out.print(table)
-        out.print("frames: rendered ones that it takes at most, before + after the one to be made", soft_wrap=True)
+        out.print("frames: rendered ones that it takes at most, before + after the one to be generated", soft_wrap=True)
+        out.print(f"ms: {times or 'not measured here yet; --measure does'}", soft_wrap=True)
         return
-    if options.name not in method_names():
-        raise InputError(f"no method {options.name!r}; there are {', '.join(method_names())}")
     method, text = _loaded(options.name)
     out.print(f"{options.name}: {text}", soft_wrap=True)
     if method is None:
         return
     out.print(f"{method.kind}; rendered frames before + after: {_frames(method)}; size of the output: {method.scale} x")
+    if times and options.name in times.ms:
+        out.print(f"{_ms(times, options.name)} ms: {times}", soft_wrap=True)
     if method.options:
         table = Table(
             title=f"options, as in {options.name}:{method.options[0].name}={written(method.options[0].value)}"
@@ -64,6 +81,24 @@ def run(options: argparse.Namespace) -> None:
         table.add_row(stage.name, takes, gives, "; ".join(needs), _runs(stage, method.stages))
     out.print(table)
     out.print('takes: "?" may be absent; "history", "target", "future" and "carry" are given at first', soft_wrap=True)
+
+
+def _measure(names: list[str], size: tuple[int, int]) -> None:
+    """Times methods on a frame of an embedded scene, and keeps the times."""
+    from jaxtrapolate.scenes import SceneSequence
+
+    methods = {name: method for name in names if (method := _loaded(name)[0]) is not None}
+    if not methods:
+        raise InputError(f"--measure: {_loaded(names[0])[1]}")
+    past, future = max(m.past for m in methods.values()), max(m.future for m in methods.values())
+    with progress(terminal(stderr=True)) as bar:
+        bar.add_task("measure", total=None)
+        keep_times(measure_methods(SceneSequence("demo", frames=2 * (past + future), size=size), methods))
+
+
+def _ms(times: MethodTimes, name: str) -> str:
+    median = times.ms[name].median if name in times.ms else None
+    return "-" if median is None else f"{median:.1f}"
 
 
 def _runs(stage: Stage, stages: tuple[Stage, ...]) -> str:

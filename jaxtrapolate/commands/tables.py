@@ -62,10 +62,11 @@ def _print_distances(results: Results, console: Console) -> None:
     table.add_column("method", no_wrap=True)
     distances = sorted({d for method in results.methods.values() for d in method.by_distance})
     for distance in (*distances, "drift"):
-        table.add_column(str(distance), justify="right", no_wrap=True)
+        table.add_column("rendered" if distance == 0 else str(distance), justify="right", no_wrap=True)
     for name, method in results.methods.items():
         drift = "-" if method.drift is None else f"{method.drift:.2f}"
-        table.add_row(name, *(decibels(method.by_distance.get(d)) for d in distances), drift)
+        found = method.by_distance or {frame.distance: method.psnr for frame in method.frames}
+        table.add_row(name, *(decibels(found.get(d)) for d in distances), drift)
     console.print(table)
 
 

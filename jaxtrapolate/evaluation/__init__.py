@@ -1,1 +1,1 @@
-"""Scoring methods on a sequence: every second frame is held back, made from the others, and compared."""
+"""Scoring methods on a sequence: every second frame is held back, generated from the others, and compared."""

@@ -54,12 +54,13 @@ def evaluate(
         factor: of every `factor` frames the first counts as rendered, the others are held back, so that several
             frames in a row are generated, each from rendered ones.
         metrics: names, as `jaxtrapolate.metrics.load` takes them; PSNR is always scored.
-        frames: score only these held-back frames.
+        frames: score only these held-back frames, and no rendered ones.
         step: told how far the work is.
 
     Returns:
         Scores by method, frame and cause of error, and run times. Only frames that every method can generate with its
-        full history are scored. `skipped` says which methods could not be scored, and why.
+        full history are scored; of a method that super samples the rendered ones too, apart (`MethodResult.rendered`,
+        and distance 0 of `by_distance`). `skipped` says which methods could not be scored, and why.
 
     Raises:
         InputError: the folder cannot be read, a frame of `frames` cannot be scored, or no method can run.
@@ -93,7 +94,8 @@ class Evaluation:
         methods: those that can run, by name.
         metrics: by name.
         slots: all frames in order of display.
-        numbers: of the frames that are scored.
+        numbers: of the generated frames that are scored.
+        rendered: the numbers of the rendered frames that are scored, with the methods that super sample.
         factor: of every `factor` frames the first is rendered.
         past: rendered frames of history that every scored frame has.
         future: rendered frames that follow every scored frame.
@@ -106,6 +108,7 @@ class Evaluation:
     metrics: Mapping[str, Metric]
     slots: tuple[Slot, ...]
     numbers: tuple[int, ...]
+    rendered: tuple[int, ...]
     factor: int
     past: int
     future: int
@@ -132,16 +135,21 @@ class Evaluation:
         past, future = max(m.past for m in usable.values()), max(m.future for m in usable.values())
         slots = tuple(held_back_slots(sequence, past=past, future=future, factor=factor))
         numbers = [slot.number for slot in slots if slot.full and not slot.rendered]
+        rendered = [slot.number for slot in slots if slot.full and slot.rendered]
+        if frames is not None or all(method.scale == 1 for method in usable.values()):
+            rendered = []
         if frames is not None:
             chosen = sorted(set(frames))
             wrong = [n for n in chosen if n not in numbers]
             if wrong or not chosen:
                 raise InputError(
-                    f"--frames: {', '.join(map(str, wrong)) or 'none'} of {sequence.name} cannot be scored; with "
-                    f"{past} rendered frames of history these can: {', '.join(map(str, numbers))}"
+                    f"{{argument}}: {', '.join(map(str, wrong)) or 'none'} of {sequence.name} cannot be scored; with "
+                    f"{past} rendered frames of history these can: {', '.join(map(str, numbers))}",
+                    argument="frames",
                 )
             numbers = chosen
-        return cls(sequence, usable, metrics, slots, tuple(numbers), factor, past, future, skipped, left_out)
+        scored = tuple(numbers), tuple(rendered)
+        return cls(sequence, usable, metrics, slots, *scored, factor, past, future, skipped, left_out)
 
     @property
     def larger(self) -> bool:
@@ -160,7 +168,7 @@ class Evaluation:
 
     def reads(self) -> list[int]:
         """The numbers of the frames that are read, whatever has been scored before."""
-        chosen = set(self.numbers)
+        chosen = {*self.numbers, *self.rendered}
         wanted = [slot.number in chosen for slot in self.slots]
         memory = any(method.memory for method in self.methods.values())
         needed = needed_slots(self.slots, wanted, memory=memory)
@@ -168,7 +176,7 @@ class Evaluation:
 
     def play(self, wanted: Callable[[str, int], bool]) -> Iterator[tuple[Slot, Window, dict[str, Generated]]]:
         """Generates the scored frames that are wanted of a method; see `jaxtrapolate.evaluation.player.play`."""
-        chosen = set(self.numbers)
+        chosen = {*self.numbers, *self.rendered}
         return play(
             self.sequence,
             self.slots,
@@ -199,11 +207,13 @@ class Evaluation:
                 gallery = Gallery(Path(folder), hdr=self.sequence.hdr)
                 return self.run(kept=kept, gallery=gallery, keep_all=keep_all, step=step)
         kept = Scores(None, self.metrics) if kept is None else kept
-        scores = {number: kept.frame(number) for number in self.numbers}
+        scores = {number: kept.frame(number) for number in (*self.numbers, *self.rendered)}
         clips = kept.clips(list(self.numbers))
         lacking = {name for name in self.methods if set(self._clip_metrics) - set(clips.get(name, {}))}
 
         def wanted(name: str, number: int) -> bool:
+            if number in self.rendered:
+                return self.methods[name].scale > 1 and name not in scores[number]
             if name not in scores[number]:
                 return True
             return gallery is not None and (keep_all or name in lacking) and not gallery.has(name, number)
@@ -214,22 +224,24 @@ class Evaluation:
             number = slot.number
             fresh = {name: result for name, result in generated.items() if name not in scores[number]}
             scores[number] |= score_window(self.sequence, slot, window, fresh, list(self.metrics.values()))
-            for name, result in generated.items():
+            for name, result in generated.items() if not slot.rendered else ():
                 if result.compile_ms is not None and name not in kept.compile:
                     kept.compile[name] = RunTime(compile=result.compile_ms, cached=result.cached)
                 if gallery is not None:
                     gallery.put(name, window, result.image)
                 if name not in kept.stages:
-                    step(f"time stages of {name}", self.numbers.index(number), total)
+                    step(f"time stages of {name}", sum(n < number for n in self.numbers), total)
                     timings = time_stages(self.methods[name], window, carry=result.carry)
                     kept.stages[name] = {
                         s: RunTime(t.median, t.iqr, t.compile, len(t.runs)) for s, t in timings.items()
                     }
             kept.write(number, scores[number])
-            step("evaluate", self.numbers.index(number) + 1, total)
+            step("evaluate", sum(n <= number for n in self.numbers), total)
         by_method = {name: [scores[n][name] for n in self.numbers] for name in self.methods}
+        larger = [name for name, method in self.methods.items() if method.scale > 1]
+        rendered = {name: [scores[n][name] for n in self.rendered] for name in larger}
         unscored = self._score_clips(by_method, clips, kept, gallery, step)
-        return self._results(by_method, clips, kept, unscored)
+        return self._results(by_method, rendered, clips, kept, unscored)
 
     @property
     def _clip_metrics(self) -> list[str]:
@@ -272,13 +284,14 @@ class Evaluation:
     def _results(
         self,
         scores: Mapping[str, list[FrameScore]],
+        rendered: Mapping[str, list[FrameScore]],
         clips: Mapping[str, Mapping[str, float]],
         kept: Scores,
         unscored: list[str],
     ) -> Results:
         methods: dict[str, MethodResult] = {}
         for name, frames in scores.items():
-            mean = mean_over_frames(frames, metrics=self.metrics)
+            mean = mean_over_frames(frames, rendered=rendered.get(name, ()), metrics=self.metrics)
             compiled = kept.compile.get(name, RunTime())
             methods[name] = dataclasses.replace(
                 mean,
@@ -306,7 +319,7 @@ class Evaluation:
             metrics={n: MetricInfo(m.per, m.better, m.unit) for n, m in self.metrics.items()},
             methods=methods,
             frames=self.numbers,
-            notes=(*self._notes(), *costs, *_reasons(scores), *unscored),
+            notes=(*self._notes(), *_of_rendered(methods), *costs, *_reasons(scores), *unscored),
             skipped=self.skipped,
         )
 
@@ -327,10 +340,20 @@ class Evaluation:
         return notes
 
 
+def _of_rendered(methods: Mapping[str, MethodResult]) -> list[str]:
+    """What methods that super sample are worth on rendered frames, a line each."""
+    found = {name: (m.by_distance.get(0), len(m.rendered)) for name, m in methods.items() if m.rendered}
+    return [
+        f"{name}: rendered frames are super sampled too: {psnr:.2f} dB over {count} of them, apart from the others"
+        for name, (psnr, count) in found.items()
+        if psnr is not None
+    ]
+
+
 def score_window(
     sequence: Sequence, slot: Slot, window: Window, generated: Mapping[str, Generated], metrics: list[Metric]
 ) -> dict[str, FrameScore]:
-    """The scores of what methods generated for a held-back frame."""
+    """The scores of what methods generated for a frame."""
     found: dict[str, FrameScore] = {}
     known: dict[int, tuple[np.ndarray | None, np.ndarray | None]] = {}
     for name, result in generated.items():

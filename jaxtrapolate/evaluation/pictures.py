@@ -14,6 +14,7 @@ from jaxtrapolate.evaluation.windows import Window
 from jaxtrapolate.files import Sequence, read_png, write_png
 from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.ops.holes import hole_masks
+from jaxtrapolate.ops.jitter import shift_motion
 from jaxtrapolate.records import CHANNELS, GBuffer
 from jaxtrapolate.report import colorize_causes, colorize_error
 from jaxtrapolate.runtime.output import writable_folder
@@ -131,7 +132,8 @@ class Gallery:
         if causes is not None:
             pictures["causes"] = self._put(number, "causes", colorize_causes(causes))
         if window.target.motion is not None and newest is window.history[-1]:
-            holes = hole_masks(here, there, window.target.motion).any
+            motion = shift_motion(window.target.motion, window.target, newest)
+            holes = hole_masks(here, there, motion).any
             marked = np.where(np.asarray(holes), np.array([0.1, 0.9, 0.2], np.float32), truth * 0.5)
             pictures["holes"] = self._put(number, "holes", eight_bit(marked))
         for method in methods:

@@ -59,7 +59,7 @@ class Player:
         """The next frame in order of display.
 
         Args:
-            window: the frame and what surrounds it; a target with colour is rendered, and is only taken note of.
+            window: the frame and what surrounds it; a target with colour is rendered: taken note of, or super sampled.
             first: whether it starts a run: memory starts anew. So it does where the size of frames changes.
 
         Returns:
@@ -121,8 +121,8 @@ def play(
         sequence: the frames.
         slots: what is shown, in order of display.
         methods: by name.
-        wanted: whether a frame is to be generated with a method; every frame that is not rendered by default. What a
-            method with memory has to see before that is replayed.
+        wanted: whether a frame is to be generated with a method, or super sampled where it is rendered; by default
+            every frame that is not rendered. What a method with memory has to see before that is replayed.
         hidden: the numbers of the frames that are held back.
         larger: whether windows hold the frames at the output's size as well, as of `load`.
 
@@ -133,7 +133,7 @@ def play(
         InputError: a method cannot run on these frames.
     """
     players = {name: Player(method) for name, method in methods.items()}
-    asked = {n: [not s.rendered and (wanted is None or wanted(n, s)) for s in slots] for n in methods}
+    asked = {n: [not s.rendered if wanted is None else wanted(n, s) for s in slots] for n in methods}
     shown = {n: needed_slots(slots, asked[n], memory=m.memory) for n, m in methods.items()}
     rows = [i for i in range(len(slots)) if any(flags[i] for flags in shown.values())]
     for i, (slot, window) in zip(

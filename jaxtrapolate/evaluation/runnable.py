@@ -30,14 +30,16 @@ def runnable(
                 f"the {len(sequence.numbers)} has {max(map(len, runs(sequence)))}"
             )
             continue
-        tried = [slots[0], chosen] if method.memory else [chosen]
+        drawn = next((slot for slot in slots if slot.full and slot.rendered), None) if method.scale > 1 else None
+        tried = [s for s in slots if s in (chosen, drawn) or (method.memory and s is slots[0])]
         try:
             for slot, window in load(sequence, tried, hidden=hidden(sequence, factor=factor)):
                 if window.truth.color is None:
                     text = f"frame {slot.number} has no colour to compare with; use generate"
                     raise InputError(f"{sequence.name}: {text}")
                 method.active(*arguments(method, window))
-                left_out[name] = method.missing(*arguments(method, window))
+                if slot == chosen:
+                    left_out[name] = method.missing(*arguments(method, window))
             usable[name] = method
         except ValueError as error:
             skipped[name] = str(error)

@@ -26,7 +26,7 @@ class Slot:
         number: of the frame; of the rendered frame before it where nothing was drawn for it.
         before: the numbers of history, oldest first: back to the oldest rendered frame that is wanted.
         behind: the numbers of future: on to the last rendered frame that is wanted.
-        rendered: whether the frame is rendered, so that a method only takes note of it.
+        rendered: whether the frame is rendered, so that a method only takes note of it, or super samples it.
         first: whether nothing comes before it: the first of the sequence, or after a gap or a cut.
         full: whether as many rendered frames are around it as were asked for.
         distance: how many frames it is after the newest rendered one; 0 for a rendered frame.

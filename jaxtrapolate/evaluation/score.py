@@ -16,6 +16,7 @@ from jaxtrapolate.metrics import Metric, psnr
 from jaxtrapolate.metrics import load as load_metric
 from jaxtrapolate.ops.causes import CAUSES, cause_map, disoccluded
 from jaxtrapolate.ops.depth import surfaces_of
+from jaxtrapolate.ops.jitter import on_own_pixels
 from jaxtrapolate.ops.motion import chain_motion
 from jaxtrapolate.ops.radiance import srgb_encode, tonemap
 from jaxtrapolate.records import Frame, replace
@@ -61,10 +62,12 @@ def causes_of(sequence: Sequence, window: Window, *, larger: bool = False) -> np
         run = around(sequence, window.number, before=len(window.history) - newest)
         source_frame, *between = (jax.device_put(sequence.larger.frame(n)) for n in run[:-1])
         truth, motion = window.larger, window.larger.motion
-    for frame in reversed(between):
-        motion = None if motion is None or frame.motion is None else chain_motion(motion, frame.motion)
-    if motion is None:
+    if motion is None or any(frame.motion is None for frame in between):
         return None
+    frames = on_own_pixels((source_frame, *between, replace(truth, motion=motion)))
+    motion = check_present("motion", frames[-1].motion, needed_by="causes")
+    for frame in reversed(frames[1:-1]):
+        motion = chain_motion(motion, check_present("motion", frame.motion, needed_by="causes"))
     hidden, metric = None, sequence.depth == "metric"
     if metric and not between and not larger:
         previous, number = around(sequence, window.number, before=1)
@@ -119,16 +122,28 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def mean_over_frames(frames: list[FrameScore], *, metrics: Iterable[str] = DEFAULT_METRICS) -> MethodResult:
-    """Means of the scores of several frames; a cause's dB over the frames in which it occurs, its share over all."""
+def mean_over_frames(
+    frames: list[FrameScore],
+    *,
+    rendered: Iterable[FrameScore] = (),
+    metrics: Iterable[str] = DEFAULT_METRICS,
+) -> MethodResult:
+    """Means of the scores of several frames; a cause's dB over the frames in which it occurs, its share over all.
+
+    Args:
+        frames: generated ones.
+        rendered: those that were super sampled: they count for `by_distance` alone, as distance 0.
+        metrics: names.
+    """
     by_cause = {}
     for cause in CAUSES:
         found = [f.by_cause[cause] for f in frames if cause in f.by_cause]
         if found:
             share = sum(c.share or 0.0 for c in found) / len(frames)
             by_cause[cause] = CauseScore(_mean(c.psnr for c in found), share)
-    distances = sorted({f.distance for f in frames})
-    apart = {d: _mean(f.psnr for f in frames if f.distance == d) for d in distances}
+    rendered = tuple(rendered)
+    every = (*rendered, *frames)
+    apart = {d: _mean(f.psnr for f in every if f.distance == d) for d in sorted({f.distance for f in every})}
     spent = [f.ms for f in frames if f.ms is not None]
     low, median, high = (float(q) for q in np.percentile(spent, (25, 50, 75))) if spent else (None, None, None)
     return MethodResult(
@@ -138,6 +153,7 @@ def mean_over_frames(frames: list[FrameScore], *, metrics: Iterable[str] = DEFAU
         by_cause=by_cause,
         by_distance=apart if len(apart) > 1 else {},
         frames=tuple(frames),
+        rendered=rendered,
     )
 
 
@@ -161,11 +177,11 @@ def mean_over_inputs(
     shared = [i for i in inputs if all(name in i for name in names)] or inputs
     shared = [i for i in shared if not any(m.psnr == math.inf for m in i.values())] or shared
 
-    def means(pick: Callable[[MethodResult], float | None]) -> dict[str, float | None]:
-        rows = [{n: pick(i[n]) for n in names if n in i} for i in shared]
+    def means(pick: Callable[[MethodResult], float | None], of: list[str] = names) -> dict[str, float | None]:
+        rows = [{n: pick(i[n]) for n in of if n in i} for i in shared]
         rows = [r for r in rows if all(v is not None for v in r.values())]
         rows = [r for r in rows if all(v is not None and math.isfinite(v) for v in r.values())] or rows
-        return {n: _mean(r[n] for r in rows if n in r) for n in names}
+        return {n: _mean(r[n] for r in rows if n in r) for n in of}
 
     whole = means(lambda m: m.psnr)
     others = {k: means(lambda m, k=k: m.metrics.get(k)) for k in dict.fromkeys(metrics) if k != "psnr"}
@@ -179,7 +195,8 @@ def mean_over_inputs(
             ]
             found[name][cause] = CauseScore(decibels[name], _mean(shares))
     distances = sorted({d for i in shared for m in i.values() for d in m.by_distance})
-    apart = {d: means(lambda m, d=d: m.by_distance.get(d)) for d in distances}
+    having = {d: [n for n in names if any(d in i[n].by_distance for i in shared if n in i)] for d in distances}
+    apart = {d: means(lambda m, d=d: m.by_distance.get(d), having[d]) for d in distances}
 
     def result(name: str) -> MethodResult:
         spent = [i[name].ms for i in shared if name in i]
@@ -190,7 +207,7 @@ def mean_over_inputs(
             metrics={k: v[name] for k, v in others.items()},
             ms=RunTime(_mean(s.median for s in spent), _mean(s.iqr for s in spent), sum(compiled), cached=cached),
             by_cause=found[name],
-            by_distance={d: v[name] for d, v in apart.items()},
+            by_distance={d: v[name] for d, v in apart.items() if name in v},
             inputs=sum(name in i for i in shared),
         )
 

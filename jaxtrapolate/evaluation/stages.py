@@ -1,10 +1,23 @@
-"""How long each stage of a method takes on its own."""
+"""How long a method takes, and each of its stages on its own."""
 
 from typing import Any
 
 from jaxtrapolate.evaluation.windows import Window, arguments
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.runtime.timing import Timing, measure
+
+
+def time_method(method: Method, window: Window, *, repeats: int = 5) -> Timing:
+    """A whole method on one frame; one with memory from a new start.
+
+    Args:
+        method: any.
+        window: the frame to be generated and what surrounds it.
+        repeats: runs that count.
+    """
+    history, target, future = arguments(method, window)
+    carry = method.init(history, target)
+    return measure(lambda: method.step(carry, history, target, future), repeats=repeats)
 
 
 def time_stages(method: Method, window: Window, *, carry: Any = None, repeats: int = 5) -> dict[str, Timing]:

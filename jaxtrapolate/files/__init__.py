@@ -18,6 +18,7 @@ from jaxtrapolate.files.exr import write_exr as write_exr
 from jaxtrapolate.files.image import read_png as read_png
 from jaxtrapolate.files.image import write_frame as write_frame
 from jaxtrapolate.files.image import write_png as write_png
+from jaxtrapolate.files.jitter import read_jitter
 from jaxtrapolate.files.listing import list_folder
 from jaxtrapolate.files.packed import CONVENTION as _PACKED
 from jaxtrapolate.files.packed import PackedSequence as PackedSequence
@@ -102,11 +103,14 @@ def _open(
 
 
 def _completed(sequence: FileSequence, stated: Settings | None, strict: bool, alone: bool) -> FileSequence:
-    """The sequence with its cuts and its larger frames, as the folder's description states them."""
+    """The sequence with its cuts, its jitter and its larger frames, as the folder's description states them."""
     if stated is not None:
         if unknown := [n for n in stated.cuts if n not in sequence.numbers]:
             raise InputError(f"{stated.path}: cuts: there is no frame {unknown[0]}; name frames that are there")
         sequence.cuts = stated.cuts
+        if stated.jitter is not None:
+            path = stated.path.parent / stated.jitter.file
+            sequence.jitter = read_jitter(path, stated.jitter, sequence.numbers, sequence.size)
         if stated.larger is not None and not alone:
             sequence.larger = _larger(sequence, stated.path, stated.path.parent / stated.larger, strict)
     return _without_gaps(sequence) if strict else sequence
@@ -129,7 +133,8 @@ def _without_gaps(sequence: FileSequence) -> FileSequence:
     if missing := gaps(sequence):
         first = missing[0]
         span = f"frame {first[0]}" if len(first) == 1 else f"frames {first[0]} to {first[-1]}"
-        raise InputError(f"{sequence.folder}: {span} missing; render what is missing, or read it without strict")
+        remedy = "render what is missing, or read it without {argument}"
+        raise InputError(f"{sequence.folder}: {span} missing; {remedy}", argument="strict")
     return sequence
 
 

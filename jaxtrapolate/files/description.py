@@ -14,6 +14,13 @@ A full example, for a multi-layer render with PNG masks beside it:
     units = "pixels"                  # or "uv" (the frame is 0..1) or "ndc" (-1..1)
     y_axis = "up"                     # or "down"
 
+    [jitter]                          # of frames whose samples are shifted by a fraction of a pixel, another one each
+    file = "jitter.csv"               # lines of a frame's number, x and y (`jaxtrapolate.files.jitter`)
+    units = "pixels"                  # or "uv" or "ndc"
+    y_axis = "down"                   # or "up"
+    shifts = "samples"                # pixel p shows the screen at p + jitter; or "image": at p - jitter, as where
+                                      # it is added to the projection
+
     [buffers]
     color = "beauty.{frame:04d}.exr"
     depth = { file = "multi.{frame:04d}.exr", layer = "ViewLayer.Depth", channels = "Z", scale = 0.01 }
@@ -71,8 +78,8 @@ below 0 to 1 / (256 - 65536 v).
 `larger = "../1080p"` names a folder of the same frames, 2, 3, ... times as large: the truth of methods that super
 sample.
 
-For the other readers the same file may hold `[motion]`, `name`, `step`, `static_ids`, `cuts` and `larger`; what
-`[motion]` leaves out keeps the reader's own default there.
+For the other readers the same file may hold `[motion]`, `[jitter]`, `name`, `step`, `static_ids`, `cuts` and `larger`;
+what `[motion]` leaves out keeps the reader's own default there.
 """
 
 import dataclasses
@@ -86,6 +93,7 @@ import numpy as np
 
 from jaxtrapolate.errors import InputError
 from jaxtrapolate.files.ids import StaticId, hexadecimal
+from jaxtrapolate.files.jitter import JitterFile, Shifted
 from jaxtrapolate.files.reader import BUFFERS
 from jaxtrapolate.files.sequence import MotionConvention
 from jaxtrapolate.files.text import BACKSLASH, read_toml
@@ -133,6 +141,7 @@ class Settings:
     static_ids: tuple[StaticId, ...] = ()
     cuts: tuple[int, ...] = ()
     larger: str | None = None
+    jitter: JitterFile | None = None
 
     def convention(self, base: MotionConvention) -> MotionConvention:
         """`base` with what `[motion]` states."""
@@ -156,6 +165,7 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
         "cuts": _numbers,
         "larger": _path_text,
         "motion": _table,
+        "jitter": _table,
         "buffers": _table,
     }
     content = _checked(path, "", content, kinds)
@@ -165,6 +175,8 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
         content.pop("motion", {}),
         {"sign": _choice(*get_args(Sign)), "units": _choice(*get_args(Units)), "y_axis": _choice(*get_args(YAxis))},
     )
+    if "jitter" in content:
+        content["jitter"] = _jitter(path, content["jitter"])
     buffers = _checked(path, "buffers.", content.pop("buffers", {}), dict.fromkeys(BUFFERS, _text_or_table))
     if not buffers and (unused := [key for key in ("hdr", "depth") if key in content]):
         raise InputError(f"{path}: {unused[0]} is for files that [buffers] describes; remove it, or add that table")
@@ -264,6 +276,15 @@ def _pattern(value: Any) -> str:
     if len(digits) > 2 or int(digits or 0) > _MOST_DIGITS:
         raise ValueError(f"a frame's number of at most {_MOST_DIGITS} digits")
     return value
+
+
+def _jitter(path: Path, table: dict[str, Any]) -> JitterFile:
+    kinds = {"units": _choice(*get_args(Units)), "y_axis": _choice(*get_args(YAxis))}
+    kinds |= {"file": _path_text, "shifts": _choice(*get_args(Shifted))}
+    table = _checked(path, "jitter.", table, kinds)
+    if "file" not in table:
+        raise InputError(f'{path}: jitter: no file; add one such as file = "jitter.csv"')
+    return JitterFile(**table)
 
 
 def _buffer(path: Path, name: str, value: str | dict[str, Any]) -> Buffer:

@@ -63,7 +63,8 @@ class PackedSequence(FileSequence):
         folder: that with the folders `color`, `motion`, ..., or one whose only subfolder with `motion` it is.
         motion: how the decoded motion vectors are stated, where it is not the default `CONVENTION`.
         name: for reports; by default the folder's.
-        step, static_ids: as in `FileSequence`.
+        step: as in `FileSequence`.
+        static_ids: as in `FileSequence`.
         strict: as for the other readers; 8-bit files have no non-finite pixels.
 
     Raises:

@@ -9,6 +9,7 @@ import collections
 import os
 import threading
 import weakref
+import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -53,6 +54,7 @@ class FileSequence(Sequence):
 
     Attributes:
         outside: what lies outside an EXR's data window is nothing: the values of buffers for which that is not 0.
+        jitter: of each frame, float32 `[2]` in pixels, where it is known (`jaxtrapolate.files.jitter`).
 
     Args:
         folder: where the files are.
@@ -68,6 +70,7 @@ class FileSequence(Sequence):
     """
 
     outside: Mapping[str, float] = MappingProxyType({"depth": np.inf, "sky": 1.0})
+    jitter: Mapping[int, np.ndarray] = MappingProxyType({})
 
     def __init__(
         self,
@@ -94,7 +97,8 @@ class FileSequence(Sequence):
         if len(self._files) < len(files):
             self.notes += (f"frame {min(files)} left out: it has no motion vectors",)
         if strict and self.notes:
-            raise InputError(f"{self.folder}: {self.notes[0]}; remove or rename its files, or read it without strict")
+            remedy = "remove or rename its files, or read it without {argument}"
+            raise InputError(f"{self.folder}: {self.notes[0]}; {remedy}", argument="strict")
         self.numbers = tuple(self._files)
         self.step, found = find_step(self.folder, self.numbers, step)
         self.notes += (found,) if found else ()
@@ -210,8 +214,11 @@ class FileSequence(Sequence):
         return {buffer: self.folder / file for buffer, file in self._files[number].items()}
 
     def identity(self) -> dict[str, Any]:
-        """Beside what all sequences have: the step and the ids that count as static."""
-        return super().identity() | {"step": self.step, "static_ids": list(self.static_ids)}
+        """Beside what all sequences have: the step, the ids that count as static, and a hash of the jitter."""
+        known = super().identity() | {"step": self.step, "static_ids": list(self.static_ids)}
+        if not self.jitter:
+            return known
+        return known | {"jitter": f"{zlib.crc32(np.stack([self.jitter[n] for n in self.numbers]).tobytes()):08x}"}
 
     def frame(self, number: int) -> Frame:
         """The frame with every buffer that is there; its arrays are read-only."""
@@ -292,7 +299,8 @@ class FileSequence(Sequence):
         images: dict[str, Any] = buffers
         fields = {field: images[field] for field in CHANNELS if field in images}
         gbuffer = GBuffer(**fields) if fields else None
-        return Frame(images.get("color"), gbuffer, images.get("motion"), time=float(number)), stored
+        jitter: Any = self.jitter.get(number)
+        return Frame(images.get("color"), gbuffer, images.get("motion"), jitter=jitter, time=float(number)), stored
 
     def _remember(self, number: int, invalid: np.ndarray | None) -> None:
         count = 0 if invalid is None else int(invalid.sum())
@@ -300,8 +308,9 @@ class FileSequence(Sequence):
         if invalid is None:
             return
         if self.strict:
-            remedy = "render it again, or read it without strict"
-            raise InputError(f"{self.folder}: frame {number} has {count} non-finite pixels (or of alpha 0); {remedy}")
+            remedy = "render it again, or read it without {argument}"
+            text = f"frame {number} has {count} non-finite pixels (or of alpha 0); {remedy}"
+            raise InputError(f"{self.folder}: {text}", argument="strict")
         self._masks[number] = np.packbits(invalid)
         while len(self._masks) > _MASKS_KEPT:
             self._masks.popitem(last=False)

@@ -1,4 +1,4 @@
-"""TOML and JSON files as tables, whatever is in them: damage and excess end in one line."""
+"""TOML and JSON files as tables, and lines of text, whatever is in them: damage and excess end in one line."""
 
 import json
 import os
@@ -33,6 +33,11 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
 def read_json(path: str | os.PathLike[str]) -> Any:
     """The value in a JSON file. Raises `InputError` as `read_toml` does."""
     return _read(path, "JSON", json.loads)
+
+
+def read_lines(path: str | os.PathLike[str]) -> list[str]:
+    """The lines of a text. Raises `InputError` as `read_toml` does."""
+    return _read(path, "text", str.splitlines)
 
 
 def _parse_toml(text: str) -> dict[str, Any]:

@@ -97,7 +97,9 @@ class UnrealSequence(FileSequence):
         scene: which one, where the folder holds several.
         motion: how the motion vectors are stated, where it is not the default `CONVENTION`.
         name: for reports; by default the folder's, and the scene's in brackets where it differs.
-        step, static_ids, strict: as in `FileSequence`.
+        step: as in `FileSequence`.
+        static_ids: as in `FileSequence`.
+        strict: as in `FileSequence`.
 
     Raises:
         InputError: no such folder, no such files, several scenes, a missing file, files of different sizes.

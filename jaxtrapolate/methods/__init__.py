@@ -46,7 +46,7 @@ _NETWORKS: dict[str, Callable[[str | PathLike[str]], Method]] = {
     "extranet": extranet.load,
     "interpolator": interpolator.load,
 }
-"""Methods with weights, each made from a file of them."""
+"""Methods with weights, each built from a file of them."""
 
 
 _DESCRIBED: dict[str, Callable[..., Method]] = _METHODS | {
@@ -108,8 +108,8 @@ def load(
         weights: for methods that have any: "default", those that come with the package; a file of weights of this
             library (`.npz`); an Orbax checkpoint (a folder); for "extranet" also the authors' `.pth.tar`.
         dtype: "float32", "bfloat16" or "float16": what colours and buffers are cast to before the stages; the image is
-            in the dtype of the colours that were given. Motion, depth, position, stencil, cameras and times stay as
-            they are, and a network computes in the dtype of its weights. `None` = nothing is cast.
+            in the dtype of the colours that were given. Motion, depth, position, stencil, cameras and times keep
+            their dtype, and a network computes in the dtype of its weights. `None` = nothing is cast.
         options: of the method, as `Method.options` lists them; see `Method.replace`.
 
     Returns:

@@ -19,7 +19,7 @@ from jaxtrapolate.records import Frame, Keyframe
 def time_fraction(history: Frames, target: Frame, future: Frames) -> Float[Array, ""]:
     """The target's time as a fraction of that between the rendered frames around it, 0 at the earlier one.
 
-    Where one of the three frames has no time, or both of those around the same, by their places in the sequence: 1/2
+    Where one of the three frames has no time, or both of those around the same, by their indices in the sequence: 1/2
     between two neighbours. In the precision of the images, at least float32, whatever that of the times.
     """
     newest, following = rendered(history)[0], upcoming(future)[0]
@@ -74,4 +74,4 @@ def _flows(state, values: Values):
 
 
 FLOWS = Stage("flows", _flows, ("previous", "next", "between"), ("forward", "backward"), reads=CHAINED)
-"""Both flows: the backward one is the chained motion, the forward one is made from it (`complete_flows`)."""
+"""Both flows: the backward one is the chained motion, the forward one is computed from it (`complete_flows`)."""

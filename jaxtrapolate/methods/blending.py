@@ -1,4 +1,4 @@
-"""Baselines that mix the rendered frames around the target, their colours as they are: nothing is demodulated."""
+"""Baselines that mix the rendered frames around the target, their colours undivided: nothing is demodulated."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -90,8 +90,8 @@ def softmax_splat() -> Method:
     side by time and by its coverage (the sum of shares that landed, at most 1), so that what one side leaves open the
     other fills; what both leave open is filled by `fill_pyramid`.
 
-    References: Niklaus and Liu 2020. Departures: no network makes the flows or mixes the warped frames: the flows are
-    the engine's, the forward one made from the backward one; depth instead of, or with, brightness constancy.
+    References: Niklaus and Liu 2020. Departures: no network finds the flows or mixes the warped frames: the flows are
+    the engine's, the forward one computed from the backward one; depth instead of, or with, brightness constancy.
     """
 
     def importance(state, values: Values):

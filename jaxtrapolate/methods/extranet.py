@@ -159,7 +159,8 @@ def encoded_truth(
     """The answer that the network should give: a frame's true colour, demodulated, in the log domain.
 
     Args:
-        color: `[H, W, 3]`, linear radiance. buffers: of the same frame; without albedo nothing is demodulated.
+        color: `[H, W, 3]`, linear radiance.
+        buffers: of the same frame; without albedo nothing is demodulated.
         preparation: of the network that is trained.
 
     Raises:

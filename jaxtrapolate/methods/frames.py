@@ -32,24 +32,24 @@ def cast(frame: Frame, dtype: Any) -> Frame:
 
 
 def rendered(history: Sequence[Frame]) -> list[int]:
-    """The places in a history of the frames with colour, newest first."""
+    """The indices in a history of the frames with colour, newest first."""
     return [i for i in range(len(history) - 1, -1, -1) if history[i].color is not None]
 
 
 def upcoming(future: Sequence[Frame]) -> list[int]:
-    """The places in a future of the frames with colour, the next first."""
+    """The indices in a future of the frames with colour, the next first."""
     return [i for i, frame in enumerate(future) if frame.color is not None]
 
 
 def neighbours(
     colored: Sequence[bool],
-    place: int,
+    index: int,
     *,
     past: int = 1,
     future: int = 0,
     numbers: Sequence[int | float] | None = None,
 ) -> tuple[range, range]:
-    """Which frames of a sequence a method is to be handed as history and future, for the frame at `place`.
+    """Which frames of a sequence a method is to be handed as history and future, for the frame at `index`.
 
     Back to the `past`-th rendered frame before it and on to the `future`-th after it, all frames between included, so
     that motion chains through those without colour; what is beyond the last rendered frame is left out. Where `numbers`
@@ -57,8 +57,9 @@ def neighbours(
 
     Args:
         colored: of each frame whether it has colour.
-        place: of the frame to be made, an index into `colored`.
-        past, future: how many rendered frames, as the `Method` wants.
+        index: of the frame to be generated, into `colored`.
+        past: how many rendered frames before it, as the `Method` wants.
+        future: how many rendered frames after it.
         numbers: of the frames (or their times), ascending by one per frame; `None` where none is missing.
 
     Returns:
@@ -66,11 +67,11 @@ def neighbours(
         where there are fewer.
 
     Raises:
-        ValueError: `place` is no index, or numbers of another length or that do not ascend.
+        ValueError: `index` is none of `colored`, or numbers of another length or that do not ascend.
     """
     count = len(colored)
-    if not 0 <= place < count:
-        raise ValueError(f"place: expected 0 to {count - 1}, got {place}")
+    if not 0 <= index < count:
+        raise ValueError(f"index: expected 0 to {count - 1}, got {index}")
     numbers = range(count) if numbers is None else numbers
     if len(numbers) != count:
         raise ValueError(f"numbers: expected {count} as there are frames, got {len(numbers)}")
@@ -78,16 +79,16 @@ def neighbours(
     if any(step <= 0 for step in steps):
         raise ValueError(f"numbers: expected each above the one before, got {list(numbers)}")
 
-    def last(places: range, wanted: int) -> int | None:
-        """The place of the `wanted`-th rendered frame, or of the last before a gap."""
+    def last(indices: range, wanted: int) -> int | None:
+        """The index of the `wanted`-th rendered frame, or of the last before a gap."""
         found = None
-        for i in places:
-            step = steps[i] if i < place else steps[i - 1]
+        for i in indices:
+            step = steps[i] if i < index else steps[i - 1]
             if wanted == 0 or step > 1:
                 break
             if colored[i]:
                 found, wanted = i, wanted - 1
         return found
 
-    first, final = last(range(place - 1, -1, -1), past), last(range(place + 1, count), future)
-    return range(place if first is None else first, place), range(place + 1, place + 1 if final is None else final + 1)
+    first, final = last(range(index - 1, -1, -1), past), last(range(index + 1, count), future)
+    return range(index if first is None else first, index), range(index + 1, index + 1 if final is None else final + 1)

@@ -1,4 +1,4 @@
-"""Baselines that warp a coarse grid laid over a rendered frame, its colour as it is: nothing is demodulated.
+"""Baselines that warp a coarse grid laid over a rendered frame, its colour undivided: nothing is demodulated.
 
 The papers' warps go forward from one frame; see `jaxtrapolate.ops.grid.grid_warp` for what departs from them.
 """

@@ -56,8 +56,12 @@ def plain_share(
     street, at night: 31.26 and 31.00); the occlusion warp has 33.49 with it and 33.62 with 1.
 
     Args:
-        newest, previous: rendered frames with albedo. motion: from the newest to the previous one.
-        by, floor: as of `demodulate`. margin: at least 0.
+        newest: a rendered frame with albedo.
+        previous: the rendered frame before it, with albedo.
+        motion: from the newest to the previous one.
+        by: as of `demodulate`.
+        floor: as of `demodulate`.
+        margin: at least 0.
     """
     truth = compress(check_present("newest.color", newest.color, needed_by="plain_share"))
     color = check_present("previous.color", previous.color, needed_by="plain_share")

@@ -113,12 +113,12 @@ def _run(stages: Sequence[Stage], state: Any, values: Values) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Method:
-    """Makes a frame from those around it: `image = method(history, target, future=())`.
+    """Generates a frame from those around it: `image = method(history, target, future=())`.
 
     history and future are tuples of `Frame` in order of display, oldest first; a frame may lack colour (only its
-    buffers were drawn): motion chains through it. target is the `Frame` to be made: its time, and whatever buffers were
-    drawn for it. A target that has colour was rendered; a method has stages for those if it super samples or remembers,
-    and returns them as they are if it has none.
+    buffers were drawn): motion chains through it. target is the `Frame` to be generated: its time, and whatever buffers
+    were drawn for it. A target that has colour was rendered; a method has stages for those if it super samples or
+    remembers, and returns them unchanged if it has none.
 
     No frame may be left out between those handed over: each one's motion leads to the one before it here, also from
     future[0] to the target (to history[-1] where the target has no motion), and from the target to history[-1]. Of a
@@ -131,12 +131,13 @@ class Method:
         name: as `jaxtrapolate.load` knows it.
         stages: in order of execution.
         kind: "extrapolation" uses the past only, "interpolation" the future too.
-        past, future: how many rendered frames it takes at most; with fewer it leaves out what needs them.
+        past: how many rendered frames of history it takes at most; with fewer it leaves out what needs them.
+        future: how many rendered frames that follow the target it takes at most.
         scale: output size over input size.
         weights: a pytree.
         settings: its options, an instance of a class that `jaxtrapolate.methods.options.settings` decorates.
         dtype: what the stages work in: colours and buffers are cast to it, and the image to what the colours were in.
-            Motion, depth, position, stencil, cameras and times stay as they are. `None` = nothing is cast.
+            Motion, depth, position, stencil, cameras and times keep their dtype. `None` = nothing is cast.
         networks: the networks on their own, by name: pure functions `(weights, *inputs) -> output` of one frame.
         start: `(history, target) -> carry`, for methods with memory: these are to be given every frame in order of
             display, the rendered ones too.
@@ -279,7 +280,7 @@ class Method:
             lacks |= more
 
     def active(self, history: Frames, target: Frame, future: Frames = ()) -> tuple[Stage, ...]:
-        """The stages that run on frames like these; none where a rendered target is returned as it is.
+        """The stages that run on frames like these; none where a rendered target is returned unchanged.
 
         Raises:
             ValueError: a stage that the method cannot do without lacks something, named in the message.
@@ -306,18 +307,18 @@ class Method:
             "before_next": future[: (*upcoming(future), len(future))[0]],
         }
 
-        def there(place: str) -> bool:
-            names, name = place.split(".")
+        def there(source: str) -> bool:
+            names, name = source.split(".")
             frames = [frame for role in names.split("+") for frame in (*roles.get(role, ()), *between.get(role, ()))]
             whole = all(roles[role] for role in names.split("+") if role in roles)
             return whole and all(buffer(frame, name) is not None for frame in frames)
 
-        def said(place: str) -> str:
-            names, name = place.split(".")
-            return f"{name} in {' and '.join(names.split('+'))}" if "+" in names else place
+        def said(source: str) -> str:
+            names, name = source.split(".")
+            return f"{name} in {' and '.join(names.split('+'))}" if "+" in names else source
 
         missing = [r.split("|") for r in stage.reads if not any(map(there, r.split("|")))]
-        return lacks + [" or ".join(map(said, places)) for places in missing]
+        return lacks + [" or ".join(map(said, read)) for read in missing]
 
     def function(
         self, state: Any, carry: Any, history: Frames, target: Frame, future: Frames = ()
@@ -335,7 +336,7 @@ class Method:
     def values_before(
         self, stage: str, state: Any, carry: Any, history: Frames, target: Frame, future: Frames = ()
     ) -> dict[str, Any]:
-        """The values that a stage gets: what the stages before it have made, as a pure function like `function`.
+        """The values that a stage gets: what the stages before it have given, as a pure function like `function`.
 
         Training runs a network's inputs through it, under vmap and jit: `values_before("network", ...)["inputs"]`.
 

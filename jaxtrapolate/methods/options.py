@@ -21,9 +21,12 @@ class Option:
     """What may be said of an option.
 
     Attributes:
-        name: of the keyword. default, value: what it is if nothing is said, and what it is now.
+        name: of the keyword.
+        default: its value if nothing is said.
+        value: its current value.
         doc: one line.
-        low, high: of a number, or of each number of a tuple; `None` where there is no bound.
+        low: the least number, also in a tuple; `None` where there is no bound.
+        high: the greatest number, also in a tuple; `None` where there is no bound.
         choices: of a string, or of each string of a tuple.
         static: whether another value is compiled anew.
         none: whether it may be `None`.
@@ -147,7 +150,7 @@ def settings(cls: type[S]) -> type[S]:
 
 
 def options_of(given: Any) -> tuple[Option, ...]:
-    """The options of a class that `settings` decorates, as they are set; none of anything else."""
+    """The options of a class that `settings` decorates, with their current values; none of anything else."""
     if not dataclasses.is_dataclass(given):
         return ()
     return tuple(

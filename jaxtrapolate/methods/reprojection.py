@@ -1,4 +1,4 @@
-"""Baselines that reproject the newest rendered frame, its colour as it is: nothing is demodulated.
+"""Baselines that reproject the newest rendered frame, its colour undivided: nothing is demodulated.
 
 "onward" is a forward motion, on the newest rendered frame's grid, to the target.
 """
@@ -39,8 +39,8 @@ def reprojection(shade: Shade | None = None) -> Method:
     """Reverse reprojection: the newest frame along the target's own motion, and a depth test that finds cache misses.
 
     A pixel misses where its motion leads outside, or where the depth there is not its own: compared relatively
-    (`epsilon`), after the change of depth that the cameras tell where positions and both cameras are there, else as it
-    is.
+    (`epsilon`), after the change of depth that the cameras tell where positions and both cameras are there, else
+    unchanged.
 
     Args:
         shade: renders what missed, given the target (which has no colour: a held-back frame's is never seen) and the
@@ -167,7 +167,7 @@ ONWARD = Stage(
 
 
 def carried_depth(values: Values) -> Array:
-    """The newest frame's depth `[H, W, 1]` as it is in the target, where that is known; zeros without depth."""
+    """The newest frame's points' depth `[H, W, 1]` in the target, where that is known; zeros without depth."""
     depth = depth_of(values["newest"])
     if depth is None:
         return jnp.zeros_like(values["onward"][..., :1])
@@ -180,7 +180,7 @@ def warp_3d() -> Method:
 
     No buffer of the target is looked at, but its camera. The forward motion of what is static is exact where cameras,
     positions and a stencil are there; else, and of what moves, it is the motion to the frame before, carried on
-    linearly. A pixel covers the four around its landing place; each of these fetches its colour bilinearly along the
+    linearly. A pixel covers the four around where it lands; each of these fetches its colour bilinearly along the
     motion that landed on it. Where the fetch would meet another surface (depths differ by more than `epsilon`) the
     pixel is beside a silhouette: there counts what lands within half a pixel, if anything does, and else the colour
     that landed. A hole takes the colour of the farthest of the next covered pixels left, right, above and below

@@ -2,10 +2,10 @@
 
 Values they pass on: "sources", the rendered frames that are warped, newest first, and "motions", from the target to
 each of them; "newest" and "motion", the first of both. "masks", bool, for each source where it shows something else,
-and "holes", the first of them. "plain_share", where the colour as it is should be preferred, from
+and "holes", the first of them. "plain_share", where the undivided colour should be preferred, from
 `jaxtrapolate.methods.hindsight`. "layers", for each source the image that is to be warped: its colour, or where that
-can be the demodulated colour, followed by the colour as it is where "plain_share" asks for both. "occlusion_motion".
-"warped", what was made of the layers for the target, and "image".
+can be the demodulated colour, followed by the undivided one where "plain_share" asks for both. "occlusion_motion".
+"warped", the layers warped to the target, and "image".
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ class Demodulation:
 
     by: By = option("albedo+specular", "what the colour is divided by before it is warped", choices=By)
     floor: float = option(0.01, "the smallest divisor", low=0, high=1)
-    sky: bool = option(True, "whether the sky's colour is warped as it is; else its albedo counts")
+    sky: bool = option(True, "whether the sky's colour is warped undivided; else its albedo counts")
     margin: float = option(2.0, "how much better the undivided colour must agree to make up half", low=0, high=1000)
 
 
@@ -91,7 +91,7 @@ _REFLECTANCE: Any = {"reads": ("history.albedo", "target.albedo"), "optional": T
 
 
 def demodulate_stage(how: Any = None) -> Stage:
-    """Divides the sources by their reflectance; without albedo the colour is warped as it is.
+    """Divides the sources by their reflectance; without albedo the colour is warped undivided.
 
     Args:
         how: has by, floor and sky, as `Demodulation`; `None` = the method's options.
@@ -110,7 +110,7 @@ def demodulate_stage(how: Any = None) -> Stage:
 
 
 def modulate_stage(how: Any = None) -> Stage:
-    """Multiplies by the target's reflectance, and mixes in the colour that was warped as it is, by "plain_share".
+    """Multiplies by the target's reflectance, and mixes in the colour that was warped undivided, by "plain_share".
 
     That colour is the method's own; the plain warp's where neither way has erred, so that what stands still is exact.
     (The plain warp's outside all hole masks costs the guided warp 0.2 dB on training seeds, where masks miss holes.)
@@ -169,7 +169,7 @@ def composite(
 def find_holes(
     target: GBuffer | None, source: GBuffer | None, motion: Array, *, taps: Taps = "nearest", **options
 ) -> Array:
-    """The union `[H, W, 1]` of all hole masks that the buffers allow, by the pixel nearest to the landing place.
+    """The union `[H, W, 1]` of all hole masks that the buffers allow, by the pixel nearest to where the motion leads.
 
     Judged by all four bilinear taps, every pixel beside a silhouette would be a hole as well. Options as of
     `hole_masks`.

@@ -87,8 +87,10 @@ class Layer(nnx.Module):
     """A convolution, then a gate, batch norm and an activation, each where it is asked for.
 
     Args:
-        inputs, outputs: channels.
-        size, stride: of the convolution.
+        inputs: channels of its input.
+        outputs: channels of its output.
+        size: of the convolution's kernel, in both directions.
+        stride: of the convolution.
         gate: "none"; "light": the result times sigmoid(a second convolution with one output channel), the same for all
             channels; "full": a gate for each channel.
         norm: batch norm with PyTorch's defaults (epsilon 1e-5, a tenth of the new statistics a step); `model.train()`
@@ -97,6 +99,7 @@ class Layer(nnx.Module):
         activation: "none", "relu" (gradient 0 at the kink), or "prelu" with a slope of each channel, 0.25 at first.
         gain: of the feature convolution's first kernel, see `convolution`. With PyTorch's initialisation signals fade
             from layer to layer unless there is a batch norm; `HE` keeps their size through a ReLU.
+        rngs: where the first weights come from.
 
     Raises:
         ValueError: an unknown `gate` or `activation`.

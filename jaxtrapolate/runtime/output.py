@@ -114,14 +114,14 @@ class Output:
             self._save()
 
     def _other(self, text: str) -> InputError:
-        return InputError(f"{self.folder}: holds another run's files: {text}; {_REMEDY}")
+        return InputError(f"{self.folder}: holds another run's files: {text}; {_REMEDY}", argument="fresh")
 
     def _save(self) -> None:
         if self._writes:
             write_json(self.folder / RECORD, self._record)
 
 
-_REMEDY = "choose another folder, or start anew with --fresh, which deletes them"
+_REMEDY = "choose another folder, or start anew with {argument}, which deletes them"
 
 
 @contextlib.contextmanager
@@ -167,7 +167,7 @@ def open_output(
             output._save()
         else:
             if text := differences(record["settings"], settings):
-                raise InputError(f"{path}: holds another run's files: {text}; {_REMEDY}")
+                raise InputError(f"{path}: holds another run's files: {text}; {_REMEDY}", argument="fresh")
             output = Output(path, record, writes=writes)
             if record["code"] != code():
                 if not any_code:
@@ -233,7 +233,7 @@ def _read_record(folder: Path, command: str, *, damaged_is_none: bool) -> dict[s
         return record
     if damaged_is_none:
         return {"settings": {"command": command}, "code": "", "parts": {}}
-    raise InputError(f"{path}: damaged; choose another folder, or start anew with --fresh")
+    raise InputError(f"{path}: damaged; choose another folder, or start anew with {{argument}}", argument="fresh")
 
 
 def _found(folder: Path, command: str) -> str | None:
