@@ -2,7 +2,7 @@
 
 python docs/pictures.py --operations --convention --scenes
 jaxtrapolate demo && python docs/pictures.py --demo demo   # or, for the same picture in less time:
-jaxtrapolate evaluate scenes:demo --size 480x270 --length 16 --methods warp,guided_warp,extranet --output demo
+jaxtrapolate evaluate scenes:demo --size 480x270 --length 16 --methods warp,guided_warp,guided_net --output demo
 """
 
 import argparse
@@ -318,7 +318,7 @@ def demo_strip(folder: Path) -> Image.Image:
     """Input, result, error and a close-up of the frame that the demo found hardest."""
     results = json.loads((folder / "results.json").read_text())
     chosen = results["pictures"][0]
-    methods = ("warp", "guided_warp", "extranet")
+    methods = ("warp", "guided_warp", "guided_net")
     scores = {
         name: next(f["psnr"] for f in results["methods"][name]["frames"] if f["number"] == chosen["number"])
         for name in methods

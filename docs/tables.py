@@ -240,7 +240,7 @@ def failures() -> str:
 
 def curve() -> str:
     """The validation gain of ExtraNet's three rounds of training, over its first guess."""
-    lines = [line for line in read("experiments/results/extranet_training.jsonl") if line["kind"] == "validation"]
+    lines = [line for line in read("experiments/results/guided_net_training.jsonl") if line["kind"] == "validation"]
     steps = (1000, 2000, 3000, 4000, 6000, 8000, 10000, 12000, 14000)
     rows = []
     for number in sorted({line["round"] for line in lines}):
@@ -255,7 +255,7 @@ def curve() -> str:
 
 
 _BY_SIZE = {name: name for name in ("warp", "occlusion_warp", "guided_warp", "warp_3d", "grid_extrapolate")} | {
-    "extranet": "**extranet**",
+    "guided_net": "**guided_net**",
     "interpolator": "interpolator (both sides)",
     "bidirectional": "bidirectional (both sides)",
 }
@@ -296,11 +296,11 @@ def stage_times() -> str:
     """Milliseconds of ExtraNet's stages, and of its networks alone, by resolution."""
     times = read("experiments/results/resolutions.json")["times"]
     rows = [
-        [title, *(_ms(sum(found["extranet's stages"][name] for name in names)) for found in times.values())]
+        [title, *(_ms(sum(found["guided_net's stages"][name] for name in names)) for found in times.values())]
         for title, names in _STAGES.items()
     ]
     rows += [[title, *(_ms(found["networks"][name]) for found in times.values())] for title, name in _ALONE.items()]
-    return table(["extranet by stage, ms", *times], rows)
+    return table(["guided_net by stage, ms", *times], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {

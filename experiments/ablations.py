@@ -1,4 +1,4 @@
-"""What each part of ExtraNet is worth: its networks trained alike on the same windows, scored on test seeds.
+"""What each part of guided_net is worth: its networks trained alike on the same windows, scored on test seeds.
 
     python experiments/ablations.py --workdir runs --output experiments/results/ablations.json
 
@@ -33,7 +33,8 @@ from jaxtrapolate.atomic import atomic_path
 from jaxtrapolate.evaluation.score import causes_of, mean_over_frames, score
 from jaxtrapolate.evaluation.windows import arguments, windows
 from jaxtrapolate.methods import Method
-from jaxtrapolate.methods.extranet import Preparation, extranet
+from jaxtrapolate.methods.extranet import Preparation
+from jaxtrapolate.methods.guided_net import NAME, NETWORK, PREPARATION, guided_net
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
 from jaxtrapolate.ops.causes import CAUSES
 from jaxtrapolate.results import FrameScore
@@ -49,14 +50,13 @@ ALONE = "walkers"
 UNLEARNED = ("warp", "occlusion_warp", "guided_warp", "first guess")
 """For comparison; "first guess" is the method with a network that corrects nothing."""
 
-OURS = ExtraNetConfig(norm=False, direct=True, contrast=4.0)
 PLAIN = ExtraNetOptions(
-    network=OURS,
+    network=NETWORK,
     space="display",
     loss="relative",
     hole_weight=0.0,
     crops="error",
-    preparation=Preparation(first_guess="guided"),
+    preparation=PREPARATION,
     windows=WindowOptions(size=SIZE),
     crop=(64, 64),
 )
@@ -75,7 +75,7 @@ def _with(**changes: Any) -> Variant:
 
 
 def _network(**changes: Any) -> Variant:
-    return _with(network=dataclasses.replace(OURS, **changes))
+    return _with(network=dataclasses.replace(NETWORK, **changes))
 
 
 VARIANTS: Mapping[str, Variant] = {
@@ -119,7 +119,7 @@ class Shared(ExtraNetTask):
 
     def __init__(self, variant: Variant, stored: Mapping[str, Mapping[str, np.ndarray]]) -> None:
         options = variant.options
-        super().__init__(dataclasses.replace(options, validation=len(stored)))
+        super().__init__(dataclasses.replace(options, validation=len(stored)), method=NAME)
         self._stored = [stored[name] for name in variant.scenes]
         self._held = self._fitting([(held, -1) for held in stored.values()])  # the last of each scene is not trained on
 
@@ -151,9 +151,7 @@ def configuration(variant: Variant, steps: int, seed: int) -> Config:
     rate = Optimizer(peak_learning_rate=2e-3, warmup=100, constant=steps // 4, floor=0.02, clip=1.0)
     often = {"log_every": min(100, steps), "checkpoint_every": steps, "validate_every": steps}
     rounds = {"batch": 8, "pool": 32, "steps_per_round": 100}
-    return Config(
-        "extranet", variant.options, steps=steps, seed=seed, optimizer=rate, ema_decay=0.998, **rounds, **often
-    )
+    return Config(NAME, variant.options, steps=steps, seed=seed, optimizer=rate, ema_decay=0.998, **rounds, **often)
 
 
 class Scorer:
@@ -179,11 +177,11 @@ class Scorer:
 
 def guess_alone() -> Method:
     """What is left of the whole when its network answers with its first guess."""
-    model = ExtraNet(OURS, rngs=nnx.Rngs(0))
+    model = ExtraNet(NETWORK, rngs=nnx.Rngs(0))
     for parameter in (model.output.feature.kernel, model.output.feature.bias):
         parameter[...] = jnp.zeros_like(parameter[...])
     model.eval()
-    return extranet(model, preparation=PLAIN.preparation)
+    return guided_net(model)
 
 
 def summary(runs: list[list[tuple[str, FrameScore]]], scenes: tuple[str, ...] = MOVING) -> dict[str, Any]:
@@ -235,7 +233,7 @@ def _run(
         report=partial(print, name, seed, flush=True),
     )
     key = json.dumps(dataclasses.asdict(variant.options.network)) + variant.options.preparation.first_guess
-    return scorer(jx.load("extranet", weights=workdir / "model"), key)
+    return scorer(jx.load(NAME, weights=workdir / "model"), key)
 
 
 def _place(options: argparse.Namespace, name: str, seed: int) -> Path:

@@ -1,4 +1,4 @@
-"""Where ExtraNet fails (Figure 21 of Guo et al. 2021), in numbers, beside the warps that know nothing of it.
+"""Where guided_net fails (Figure 21 of Guo et al. 2021), in numbers, beside the warps that know nothing of it.
 
     python experiments/failures.py --output experiments/results/failures.json
 
@@ -35,7 +35,7 @@ from jaxtrapolate.training.windows import MOVING, scene_window
 SIZE = (180, 320)
 STEPS = (1.0, 2.0, 4.0)
 FLASH = 3.0
-METHODS = ("warp", "occlusion_warp", "guided_warp", "extranet")
+METHODS = ("warp", "occlusion_warp", "guided_warp", "guided_net")
 TIME = 13.0
 
 

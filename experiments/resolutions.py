@@ -1,4 +1,4 @@
-"""ExtraNet by resolution: its stages' times, other methods' times, its error, light gates against full ones.
+"""guided_net by resolution: its stages' times, other methods' times, its error, light gates against full ones.
 
     python experiments/resolutions.py --output experiments/results/resolutions.json
 
@@ -23,14 +23,14 @@ from jaxtrapolate.evaluation.score import causes_of, mean_over_frames, score
 from jaxtrapolate.evaluation.stages import time_stages
 from jaxtrapolate.evaluation.windows import Window, arguments, windows
 from jaxtrapolate.methods import Method
-from jaxtrapolate.methods.extranet import Preparation, extranet
+from jaxtrapolate.methods.guided_net import guided_net
 from jaxtrapolate.networks.extranet import GATED_CONVOLUTION, ExtraNet, ExtraNetConfig
 from jaxtrapolate.runtime.timing import machine, measure, measure_pairs
 from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence
 
 SIZES = {"480p": (480, 854), "720p": (720, 1280), "1080p": (1080, 1920)}
 METHODS = ("warp", "occlusion_warp", "guided_warp", "warp_3d", "grid_extrapolate", "bidirectional", "interpolator",
-           "extranet")  # fmt: skip
+           "guided_net")  # fmt: skip
 GATES = {
     "light gates": ExtraNetConfig(),
     "full gates": ExtraNetConfig(gate="full"),
@@ -60,7 +60,7 @@ def gates(window: Window, repeats: int) -> dict[str, float]:
     """ms of the bare networks on one frame's inputs, taken in turn; weights are random, which costs the same."""
     calls = {}
     for name, config in GATES.items():
-        method = extranet(ExtraNet(config, rngs=nnx.Rngs(0)), preparation=Preparation(first_guess="guided"))
+        method = guided_net(ExtraNet(config, rngs=nnx.Rngs(0)))
         history, target, future = arguments(method, window)
         inputs = method.values_before("network", method.state, (), history, target, future)["inputs"]
         given = tuple(inputs[key] for key in ("x", "mask", "features", "history"))
@@ -116,13 +116,13 @@ def _times(known: dict[str, Method], here: list[Window], repeats: int) -> dict[s
         for name, method in known.items():
             given = arguments(method, window)
             whole[name].append(measure(lambda m=method, g=given: m.step(m.init(*g[:2]), *g), repeats=repeats).median)
-        if "extranet" in known:
-            for stage, timing in time_stages(known["extranet"], window, repeats=repeats).items():
+        if "guided_net" in known:
+            for stage, timing in time_stages(known["guided_net"], window, repeats=repeats).items():
                 stages.setdefault(stage, []).append(timing.median)
     means = {name: float(np.mean(values)) for name, values in whole.items()}
     by_stage = {name: float(np.mean(values)) for name, values in stages.items()}
     print(means, by_stage, flush=True)
-    return {"whole": means, "extranet's stages": by_stage, "networks": gates(here[0], repeats)}
+    return {"whole": means, "guided_net's stages": by_stage, "networks": gates(here[0], repeats)}
 
 
 def _print(content: dict[str, Any]) -> None:
@@ -134,7 +134,7 @@ def _print(content: dict[str, Any]) -> None:
                 table.add_column(column)
             rows: dict[str, list[str]] = {}
             for found in sizes.values():
-                stages = {f"extranet: {name}": ms for name, ms in found.get("extranet's stages", {}).items()}
+                stages = {f"guided_net: {name}": ms for name, ms in found.get("guided_net's stages", {}).items()}
                 by_name = found if kind == "errors" else found["whole"] | stages | found["networks"]
                 for name, entry in by_name.items():
                     rows.setdefault(name, []).append(f"{entry[value] if kind == 'errors' else entry:.2f}")

@@ -290,7 +290,7 @@ def test_methods_take_nothing_for_far(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*METHODS, *LONG, "extranet"])
+@pytest.mark.parametrize("name", [*METHODS, *LONG, "guided_net"])
 def test_gradients_of_methods_are_finite(name):
     method = jx.load(name)
     history, target, future = jax.tree.map(jnp.asarray, given(method, 0.0))

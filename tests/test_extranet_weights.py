@@ -18,8 +18,10 @@ from jaxtrapolate.commands.main import main
 from jaxtrapolate.evaluation.score import causes_of, score
 from jaxtrapolate.evaluation.windows import arguments, windows
 from jaxtrapolate.files import write_unreal_frame
+from jaxtrapolate.methods import BEST_FIRST, default_methods
 from jaxtrapolate.methods import extranet as module
 from jaxtrapolate.methods.extranet import RELEASE, Preparation, extranet
+from jaxtrapolate.methods.guided_net import PREPARATION
 from jaxtrapolate.records import replace
 from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence
 
@@ -34,7 +36,7 @@ def model():
 
 def test_default_weights_are_of_the_public_layout():
     """The bare network takes x, mask, features and history as the authors' does; a file tells what it is."""
-    method = jx.load("extranet")
+    method = jx.load("guided_net")
     x, mask, features, history = (
         jnp.asarray(oracles.random(*shape, seed=k))
         for k, shape in enumerate(((9, 13, 6), (9, 13, 1), (9, 13, 6), (3, 9, 13, 4)))
@@ -42,9 +44,33 @@ def test_default_weights_are_of_the_public_layout():
     answer = method.network(x, mask, features, history)
     assert answer.shape == (9, 13, 3)
     assert np.isfinite(answer).all()
-    path = weights.default_weights("extranet")
+    path = weights.default_weights("guided_net")
     assert path.stat().st_size <= weights.files.LARGEST
     assert len(weights.load_weights(path).note) > 20
+
+
+def test_the_papers_network_has_no_default_weights_and_is_no_default():
+    with pytest.raises(ValueError, match=r"^method 'extranet': no default weights come with this version; [^\n]*$"):
+        jx.load("extranet")
+    assert "extranet" in jx.method_names()
+    assert {"guided_net", "guided_warp", "interpolator"} <= set(default_methods())
+    assert set(jx.method_names()) - set(default_methods()) == {"extranet"}
+    assert "extranet" not in BEST_FIRST
+    assert "guided_net" in BEST_FIRST
+
+
+def test_a_network_of_our_own_is_loaded_by_its_name(model, tmp_path):
+    """The same stages and weights under both names, and neither takes the other's files."""
+    config, tree = module.extranet_config(model.config, PREPARATION), nnx.to_pure_dict(nnx.state(model))
+    path, other = (weights.save_weights(tmp_path, n, tree, config=config, note="") for n in ("guided_net", "extranet"))
+    history, target = make_window()
+    method = jx.load("guided_net", weights=path)
+    assert method.name == "guided_net"
+    expected = image_of(extranet(model, preparation=PREPARATION), history, target)
+    assert np.array_equal(image_of(method, history, target), expected)
+    for name, file in (("guided_net", other), ("extranet", path)):
+        with pytest.raises(ValueError, match=f"expected '{name}'"):
+            jx.load(name, weights=file)
 
 
 @pytest.mark.slow
@@ -52,7 +78,7 @@ def test_default_weights_are_of_the_public_layout():
 def test_default_weights_are_ahead_of_their_inputs(name):
     """On test seeds, by at least a decibel over the warp and the occlusion composite, and ahead of the guided warp."""
     sequence = SceneSequence(name, TEST_SEEDS[1], frames=10, size=(90, 160))
-    methods = {m: jx.load(m) for m in ("occlusion_warp", "guided_warp", "extranet")}
+    methods = {m: jx.load(m) for m in ("occlusion_warp", "guided_warp", "guided_net")}
     decibels = {m: [] for m in methods}
     for window in windows(sequence, [7, 9], past=3):
         causes = causes_of(sequence, window)
@@ -60,8 +86,8 @@ def test_default_weights_are_ahead_of_their_inputs(name):
             image = method(*arguments(method, window))
             decibels[m].append(score(image, window, causes, None, hdr=True).psnr)
     mean = {m: np.mean(values) for m, values in decibels.items()}
-    assert mean["extranet"] > mean["occlusion_warp"] + 1
-    assert mean["extranet"] > mean["guided_warp"]
+    assert mean["guided_net"] > mean["occlusion_warp"] + 1
+    assert mean["guided_net"] > mean["guided_warp"]
 
 
 @pytest.fixture(scope="module")

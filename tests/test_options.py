@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import small_extranet
 from synthetic import make_frame
 
 import jaxtrapolate as jx
@@ -17,6 +18,8 @@ from jaxtrapolate.methods.options import options_of, parsed, written
 from jaxtrapolate.records import replace
 
 SIZE = (16, 24)
+
+NETWORKS = ("guided_net", "extranet", "interpolator")
 
 
 def window(size=SIZE):
@@ -31,7 +34,7 @@ def between(size=SIZE):
 
 def test_every_option_is_described():
     for name in jx.method_names():
-        method = jx.load(name)
+        method = small_extranet.load(name)
         assert method.options == options_of(method.settings)
         for option in method.options:
             assert option.doc
@@ -204,7 +207,7 @@ def test_what_is_cast():
     assert newest.motion.dtype == np.float32
 
 
-@pytest.mark.parametrize("name", [n for n in jx.method_names() if n not in ("dis", "extranet", "interpolator")])
+@pytest.mark.parametrize("name", [n for n in jx.method_names() if n not in ("dis", *NETWORKS)])
 def test_every_method_in_bfloat16(unchecked, name, strict):
     """No buffer of one dtype meets one of another unawares."""
     method = jx.load(name, dtype="bfloat16")

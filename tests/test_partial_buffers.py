@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import small_extranet
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -15,10 +16,10 @@ from jaxtrapolate.records import CHANNELS, Camera, Frame, GBuffer, Keyframe
 
 SIZE = (8, 12)
 NAMES = sorted(set(jx.method_names()) - {"dis"})  # that one runs on the host, and reads colours alone
-NETWORKS = ("extranet", "interpolator")
+NETWORKS = ("guided_net", "extranet", "interpolator")
 BUFFERS = ("albedo", "depth", "normal", "position", "specular", "metallic", "stencil", "sky", "sky_color")
 
-load = functools.cache(jx.load)
+load = functools.cache(small_extranet.load)
 
 
 def image(channels):

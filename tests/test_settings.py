@@ -27,6 +27,7 @@ from jaxtrapolate.commands.main import main
 from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.files import write_unreal_frame
 from jaxtrapolate.methods.extranet import extranet
+from jaxtrapolate.methods.guided_net import guided_net
 from jaxtrapolate.methods.interpolator import interpolator
 from jaxtrapolate.metrics import image as metrics
 from jaxtrapolate.networks import Interpolator, InterpolatorConfig
@@ -278,9 +279,9 @@ def test_the_widest_dtype():
 
 def method(name):
     """Networks are small ones with random weights."""
-    if name == "extranet":
+    if name in ("guided_net", "extranet"):
         config = ExtraNetConfig(widths=(4, 6), warps=2, features=6, histories=3)
-        return extranet(small_extranet.random_model(config))
+        return {"guided_net": guided_net, "extranet": extranet}[name](small_extranet.random_model(config))
     if name == "interpolator":
         return interpolator(small_extranet.random_model(InterpolatorConfig(widths=(4, 6)), Interpolator))
     return jx.load(name)
@@ -325,7 +326,7 @@ def test_methods_in_other_precisions(unchecked, name, dtype):
     found = method(name)
     arguments = given(found, dtype=jnp.dtype(dtype))
     result = kinds(lambda state, *a: found.function(state, (), *a)[1], found.state, *arguments)
-    assert result == {"float32" if name == "extranet" and dtype != "float64" else dtype}
+    assert result == {"float32" if name in ("guided_net", "extranet") and dtype != "float64" else dtype}
 
 
 # Scenes

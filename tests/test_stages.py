@@ -10,7 +10,7 @@ from synthetic import make_frame
 
 import jaxtrapolate as jx
 from jaxtrapolate.evaluation.windows import hide
-from jaxtrapolate.methods import Method, Stage
+from jaxtrapolate.methods import Method, Stage, default_methods
 from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.records import Frame, replace
@@ -241,12 +241,15 @@ def lit(time):
     return replace(frame, color=frame.gbuffer.albedo, gbuffer=gbuffer)
 
 
-OPTIONAL = [(name, s.name) for name in jx.method_names() for s in jx.load(name).stages if s.optional]
+OPTIONAL = [(name, s.name) for name in default_methods() for s in jx.load(name).stages if s.optional]
 
 
 @pytest.mark.parametrize(
     ("name", "left_out"),
-    [pytest.param(*p, marks=pytest.mark.slow) if p[0] in ("extranet", "bidirectional_guided") else p for p in OPTIONAL],
+    [
+        pytest.param(*p, marks=pytest.mark.slow) if p[0] in ("guided_net", "bidirectional_guided") else p
+        for p in OPTIONAL
+    ],
 )
 def test_any_optional_stage_may_be_left_out(name, left_out):
     """Never is light shown that was not multiplied by the reflectance again: that would be white."""

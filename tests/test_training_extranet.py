@@ -192,7 +192,7 @@ def test_a_scene_without_albedo_or_sky():
 
 
 def test_shipped_configurations():
-    for name in ("extranet", "extranet_cpu", "extranet_paper"):
+    for name in ("extranet", "guided_net", "guided_net_cpu", "guided_net_more"):
         config = load_config(name)
         assert isinstance(config.options, ExtraNetOptions)
         multiple = config.options.network.multiple
@@ -229,14 +229,14 @@ def test_a_short_run_learns_and_its_weights_load(tmp_path):
     options = ExtraNetOptions(
         network=SMALL, windows=windows, crop=(32, 48), validation=2, preparation=Preparation(first_guess="guided")
     )
-    config = Config("extranet", options, steps=120, batch=4, pool=8, steps_per_round=60, log_every=20,
+    config = Config("guided_net", options, steps=120, batch=4, pool=8, steps_per_round=60, log_every=20,
                     checkpoint_every=120, validate_every=120, optimizer=Optimizer(peak_learning_rate=3e-3))  # fmt: skip
     scores = train_and_evaluate(config, tmp_path)
     assert set(scores) >= {"gain", "psnr", "psnr_hole", "guess", "composite"}
     lines = [line for line in (tmp_path / "metrics.jsonl").read_text().splitlines() if '"train"' in line]
     losses = [float(line.split('"loss": ')[1].split(",")[0]) for line in lines]
     assert np.mean(losses[-2:]) < 0.7 * losses[0]
-    method = jx.load("extranet", weights=tmp_path / "model")
+    method = jx.load("guided_net", weights=tmp_path / "model")
     window = make_window()
     image = method(window.history, window.target)
     assert np.isfinite(image).all()

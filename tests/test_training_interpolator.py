@@ -139,5 +139,5 @@ def test_a_short_run_learns_and_becomes_a_file(capsys, tmp_path):
     assert half.stat().st_size < 0.6 * path.stat().st_size + 20_000
     rounded = jx.load("interpolator", weights=half)(window.history, window.target, window.future)
     np.testing.assert_allclose(rounded, images[0], atol=0.02)
-    with pytest.raises(ValueError, match="weights of method 'interpolator', expected 'extranet'"):
-        jx.load("extranet", weights=path)
+    with pytest.raises(ValueError, match="weights of method 'interpolator', expected 'guided_net'"):
+        jx.load("guided_net", weights=path)

@@ -7,7 +7,7 @@ from typing import Any
 from jaxtrapolate.commands.evaluate import Request, evaluate_into
 from jaxtrapolate.commands.inputs import add_fresh, check_count, open_methods, parse_size, steps, terminal
 from jaxtrapolate.commands.tables import print_table
-from jaxtrapolate.methods import method_names
+from jaxtrapolate.methods import default_methods
 
 
 def add_parser(subparsers: Any) -> None:
@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> None:
     folder = Path(options.output)
     frames = check_count("--frames", options.frames)
     sequence = SceneSequence("demo", frames=frames, size=parse_size(options.size))
-    methods, unavailable = open_methods(method_names())
+    methods, unavailable = open_methods(default_methods())
     console = terminal(stderr=True)
     with steps(console) as step:
         request = Request(methods, unavailable, fresh=options.fresh)

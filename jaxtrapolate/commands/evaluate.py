@@ -36,7 +36,7 @@ from jaxtrapolate.evaluation.score import DEFAULT_METRICS
 from jaxtrapolate.evaluation.video import write_evaluation_video
 from jaxtrapolate.evaluation.windows import load
 from jaxtrapolate.files import Sequence
-from jaxtrapolate.methods import Method, method_names
+from jaxtrapolate.methods import Method, default_methods, method_names
 from jaxtrapolate.metrics import Metric, metric_names
 from jaxtrapolate.metrics import load as load_metric
 from jaxtrapolate.report import write_report
@@ -56,7 +56,9 @@ def add_parser(subparsers: Any) -> None:
     )
     add_input(parser, several=True)
     parser.add_argument(
-        "--methods", metavar="A,B,C", help=f"separated by commas, of {', '.join(method_names())} (all that can run)"
+        "--methods",
+        metavar="A,B,C",
+        help=f"separated by commas, of {', '.join(method_names())} (all but extranet that can run)",
     )
     add_weights(parser)
     parser.add_argument("--output", required=True, metavar="DIR", help="for results.json, report.html and pictures")
@@ -129,7 +131,7 @@ def run(options: argparse.Namespace) -> int:
     """Runs the command; 2 where some of several inputs could not be used, or no method ran."""
     console, out = terminal(stderr=True), terminal()
     named = options.methods is not None
-    methods, unavailable = open_methods(options.methods if named else method_names(), weights=options.weights)
+    methods, unavailable = open_methods(options.methods if named else default_methods(), weights=options.weights)
     metrics = open_metrics(options.metrics)
     inputs = named_inputs(options.inputs, **{n: getattr(options, n) for n in _OF_INPUTS})
     if options.pictures < 0:

@@ -20,7 +20,7 @@ from jaxtrapolate.evaluation.score import DEFAULT_METRICS, causes_of, mean_over_
 from jaxtrapolate.evaluation.stages import time_stages
 from jaxtrapolate.evaluation.windows import Window, load
 from jaxtrapolate.files import Sequence, gaps, open_sequence
-from jaxtrapolate.methods import Method, method_names
+from jaxtrapolate.methods import Method, default_methods
 from jaxtrapolate.methods import load as load_method
 from jaxtrapolate.metrics import Metric
 from jaxtrapolate.metrics import load as load_metric
@@ -50,7 +50,7 @@ def evaluate(
     Args:
         sequence: the frames, or the path of a folder that `open_sequence` reads.
         methods: names, as `jaxtrapolate.load` takes them, or methods by the names that they have in the results;
-            `None` for all that can run.
+            `None` for those of `default_methods` that can run.
         factor: of every `factor` frames the first counts as rendered, the others are held back, so that several
             frames in a row are generated, each from rendered ones.
         metrics: names, as `jaxtrapolate.metrics.load` takes them; PSNR is always scored.
@@ -73,7 +73,7 @@ def evaluate(
     if isinstance(methods, Mapping):
         found = dict(methods)
     else:
-        for name in method_names() if methods is None else methods:
+        for name in default_methods() if methods is None else methods:
             try:
                 found[name] = load_method(name)
             except ValueError as error:

@@ -12,6 +12,7 @@ from jaxtrapolate.methods import (
     blending,
     extranet,
     grids,
+    guided_net,
     interpolator,
     opticalflow,
     reprojection,
@@ -43,6 +44,7 @@ _METHODS: dict[str, Callable[[], Method]] = {
 
 
 _NETWORKS: dict[str, Callable[[str | PathLike[str]], Method]] = {
+    "guided_net": guided_net.load,
     "extranet": extranet.load,
     "interpolator": interpolator.load,
 }
@@ -50,12 +52,13 @@ _NETWORKS: dict[str, Callable[[str | PathLike[str]], Method]] = {
 
 
 _DESCRIBED: dict[str, Callable[..., Method]] = _METHODS | {
+    "guided_net": guided_net.guided_net,
     "extranet": extranet.extranet,
     "interpolator": interpolator.interpolator,
 }
 
 BEST_FIRST = (
-    *("bidirectional_guided", "bidirectional", "extranet", "guided_warp", "bidirectional_image", "interpolator"),
+    *("bidirectional_guided", "bidirectional", "guided_net", "guided_warp", "bidirectional_image", "interpolator"),
     *("occlusion_warp", "softmax_splat", "dis", "warp", "blend", "repeat"),
 )
 """Methods by what they have been worth on embedded scenes: what is used where none is named is the first that can."""
@@ -73,6 +76,11 @@ def _others() -> dict[str, EntryPoint]:
 def method_names() -> tuple[str, ...]:
     """The names that `load` knows, those of other installed packages last; some need a file of weights."""
     return (*_METHODS, *_NETWORKS, *_others())
+
+
+def default_methods() -> tuple[str, ...]:
+    """The methods that are tried where none is named: all but the paper's network, of which `guided_net` is ours."""
+    return tuple(name for name in method_names() if name != extranet.NAME)
 
 
 def method_description(name: str) -> str:

@@ -42,7 +42,7 @@ from jaxtrapolate.precision import widest
 from jaxtrapolate.records import GBuffer
 from jaxtrapolate.weights import configured, read_torch
 
-_NAME = "extranet"
+NAME = "extranet"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,7 +190,7 @@ def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
     return Stage("inputs", function, ("target", "layers", "masks", "histories", "warped", *COMPOSITE), ("inputs",))
 
 
-def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Method:
+def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name: str = NAME) -> Method:
     """Up to three rendered frames warped, demodulated, holes marked, and shaded by a network (ExtraNet).
 
     The three newest rendered frames are warped to the target, demodulated, and with masks; where fewer can be had the
@@ -207,6 +207,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
     Args:
         model: its batch norms are used as in evaluation.
         preparation: what the model was trained on.
+        name: of the method.
 
     Raises:
         ValueError: a model with other features than these 6 or none, or with more warped images than these two.
@@ -270,14 +271,34 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation()) -> Me
         SKY,
     )
     given = Guide() if guided else ()
-    return Method(_NAME, stages, past=past, weights=weights, settings=given, networks={"network": function})
+    return Method(name, stages, past=past, weights=weights, settings=given, networks={"network": function})
+
+
+def read_network(path: str | PathLike[str], name: str) -> tuple[ExtraNet, Preparation]:
+    """A network and its preparation, from a file of this library or an Orbax checkpoint.
+
+    Args:
+        path: see `jaxtrapolate.weights.read_weights`.
+        name: of the method whose weights these have to be.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: one line that names the file: damaged, of another method, or with weights that do not fit.
+    """
+
+    def build(stated: Mapping[str, Any]):
+        config = configured(ExtraNetConfig, stated.get("network", {}), source=str(path))
+        return lambda: ExtraNet(config, rngs=nnx.Rngs(0))
+
+    model, stated = load_network(path, name, build)
+    return model, configured(Preparation, stated.get("preparation", {}), source=str(path))
 
 
 def load_extranet(path: str | PathLike[str]) -> tuple[ExtraNet, Preparation]:
-    """A network and its preparation, from a file of this library, an Orbax checkpoint, or the authors' `.pth.tar`.
+    """The same of the method "extranet", from the authors' `.pth.tar` too.
 
     Args:
-        path: what ends in `.npz` is read by `load_weights`, a folder by `load_orbax`, all else by `read_torch`.
+        path: what ends in `.npz` and folders are read by `read_network`, all else by `read_torch`.
 
     Raises:
         OSError: the file cannot be read.
@@ -295,17 +316,11 @@ def load_extranet(path: str | PathLike[str]) -> tuple[ExtraNet, Preparation]:
             return extranet_from_torch(arrays), RELEASE
         except ValueError as error:
             raise ValueError(f"{printable(path)}: no weights of ExtraNet: {error}") from error
-
-    def build(stated: Mapping[str, Any]):
-        config = configured(ExtraNetConfig, stated.get("network", {}), source=str(path))
-        return lambda: ExtraNet(config, rngs=nnx.Rngs(0))
-
-    model, stated = load_network(path, _NAME, build)
-    return model, configured(Preparation, stated.get("preparation", {}), source=str(path))
+    return read_network(path, NAME)
 
 
 def extranet_config(config: ExtraNetConfig, preparation: Preparation) -> dict[str, Any]:
-    """What a file of weights states about them, as `load_extranet` reads it."""
+    """What a file of weights states about them, as `read_network` reads it."""
     return {"network": dataclasses.asdict(config), "preparation": dataclasses.asdict(preparation)}
 
 

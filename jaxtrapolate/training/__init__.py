@@ -1,5 +1,8 @@
 """Training: one loop for all networks, configured by TOML files; `jaxtrapolate train`."""
 
+from functools import partial
+
+from jaxtrapolate.methods import guided_net
 from jaxtrapolate.training.checkpoints import model_arrays as model_arrays
 from jaxtrapolate.training.config import Config as Config
 from jaxtrapolate.training.config import Optimizer as Optimizer
@@ -15,4 +18,5 @@ from jaxtrapolate.training.tasks import Entry as Entry
 from jaxtrapolate.training.tasks import Task as Task
 
 TASKS["extranet"] = Entry(ExtraNetOptions, ExtraNetTask)
+TASKS["guided_net"] = Entry(ExtraNetOptions, partial(ExtraNetTask, method=guided_net.NAME))
 TASKS["interpolator"] = Entry(InterpolatorOptions, InterpolatorTask)

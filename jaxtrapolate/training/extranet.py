@@ -12,7 +12,7 @@ from jaxtyping import Array, PRNGKeyArray
 
 from jaxtrapolate.checks import Size, check_present
 from jaxtrapolate.evaluation.windows import Window
-from jaxtrapolate.methods.extranet import Preparation, encoded_truth, extranet, extranet_config
+from jaxtrapolate.methods.extranet import NAME, Preparation, encoded_truth, extranet, extranet_config
 from jaxtrapolate.methods.stages import reflecting
 from jaxtrapolate.metrics import psnr
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
@@ -73,7 +73,11 @@ class ExtraNetOptions:
 
 
 class ExtraNetTask:
-    """Trains an `ExtraNet` on what the method "extranet" shows it. Where the sky is, nothing is learned or scored.
+    """Trains an `ExtraNet` on what its method shows it. Where the sky is, nothing is learned or scored.
+
+    Args:
+        options: see `ExtraNetOptions`.
+        method: of which the weights are to be, "extranet" or "guided_net".
 
     An example holds the network's inputs, histories `[H, W, N, 4]` so that all is cut alike; "target", the true light
     in the log domain, NaN at the sky; and "divisor", the target's reflectance.
@@ -81,7 +85,7 @@ class ExtraNetTask:
 
     score = "gain"
 
-    def __init__(self, options: ExtraNetOptions = ExtraNetOptions()) -> None:
+    def __init__(self, options: ExtraNetOptions = ExtraNetOptions(), *, method: str = NAME) -> None:
         self.options = options
         # preparation looks at the configuration alone
         self._stages = extranet(ExtraNet(options.network, rngs=nnx.Rngs(0)), preparation=options.preparation)
@@ -91,7 +95,7 @@ class ExtraNetTask:
         self._held: Example | None = None
         config = extranet_config(options.network, options.preparation)
         scenes = ", ".join(options.windows.scenes)
-        self.about: Mapping[str, Any] = {"method": "extranet", "config": config, "note": f"trained on {scenes}"}
+        self.about: Mapping[str, Any] = {"method": method, "config": config, "note": f"trained on {scenes}"}
 
     def _prepare(self, window: Window, key: PRNGKeyArray) -> Example:
         del key
