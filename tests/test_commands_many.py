@@ -95,7 +95,7 @@ def test_options_of_embedded_scenes(scenes):
     assert (sequence.name, sequence.size, sequence.numbers) == ("demo-3", (36, 64), tuple(range(7)))
     with pytest.raises(InputError, match=r"--length: expected a number from 1 to .*, got 0"):
         named_inputs(["scenes:demo"], length=0)
-    with pytest.raises(InputError, match="--size, --length: are for embedded scenes"):
+    with pytest.raises(InputError, match="--size, --length, --scale, --jitter: are for embedded scenes"):
         named_inputs(["folder"], size="64x36")
 
 

@@ -17,10 +17,11 @@ from jaxtrapolate.errors import InputError
 from jaxtrapolate.evaluation.evaluate import Evaluation
 from jaxtrapolate.evaluation.pictures import Gallery
 from jaxtrapolate.evaluation.schedule import held_back_slots
-from jaxtrapolate.evaluation.score import mean_over_inputs
+from jaxtrapolate.evaluation.score import causes_of, mean_over_inputs
 from jaxtrapolate.evaluation.windows import arguments, windows
 from jaxtrapolate.files import open_sequence, read_png, runs, write_exr, write_unreal_frame
 from jaxtrapolate.methods import Method, Stage
+from jaxtrapolate.ops.causes import CAUSES
 from jaxtrapolate.ops.jitter import on_own_pixels, shift_camera
 from jaxtrapolate.results import Results
 from jaxtrapolate.scenes import SceneSequence
@@ -202,6 +203,24 @@ def test_methods_fetch_jittered_frames_where_their_samples_are(name):
     image = np.asarray(method((given[0],), given[1], future))
     error = np.abs(image - frames[1].color)[4:-4, 4:-4].max()
     assert (error < 0.02) == (name != "blend"), error  # blend fetches nothing: it mixes pixel by pixel
+
+
+def test_causes_of_jittered_frames():
+    """All stands still; the newest frame's samples lie 0.8 pixels left of the target's: the last column leads out."""
+
+    class Still(SyntheticSequence):
+        def frame(self, number):
+            jitter = np.float32([0.4 if number % 2 else -0.4, 0])
+            return jx.replace(make_frame(0, self.size), motion=np.zeros((*self.size, 2), np.float32), jitter=jitter)
+
+        def keyframe(self, number):
+            return None
+
+    sequence = Still(range(4))
+    (window,) = windows(sequence, [1], past=1)
+    border = causes_of(sequence, window) == CAUSES.index("border")
+    assert border[:, -1].all()
+    assert not border[:, :-1].any()
 
 
 def test_a_jittered_camera_projects_to_pixels():

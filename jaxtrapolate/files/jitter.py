@@ -7,7 +7,8 @@ A line for each frame: its number, then x and y, with spaces, tabs, commas or se
 import dataclasses
 import math
 import re
-from collections.abc import Iterable
+import zlib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -69,6 +70,11 @@ def read_jitter(path: Path, stated: JitterFile, numbers: Iterable[int], size: Si
     if missing := [n for n in numbers if n not in found]:
         raise InputError(f"{path}: has no line for frame {missing[0]}; add it")
     return {n: found[n] for n in numbers}
+
+
+def fingerprint(jitter: Mapping[int, np.ndarray]) -> str:
+    """A hash of the jitter of all frames, which is the same in a copy of the folder."""
+    return f"{zlib.crc32(np.stack(list(jitter.values())).tobytes()):08x}"
 
 
 def _is_number(word: str) -> bool:

@@ -9,7 +9,6 @@ import collections
 import os
 import threading
 import weakref
-import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -24,6 +23,7 @@ from jaxtrapolate.files.convention import convert
 from jaxtrapolate.files.exr import exr_outside, exr_size, layer_channels, pick
 from jaxtrapolate.files.ids import Numbering, StaticId, clear_static, distinct, plain
 from jaxtrapolate.files.image import image_size
+from jaxtrapolate.files.jitter import fingerprint
 from jaxtrapolate.files.listing import find_step
 from jaxtrapolate.files.repair import fill_nearest, no_depth, nonfinite_pixels, repair
 from jaxtrapolate.files.sequence import MotionConvention, Sequence
@@ -216,9 +216,7 @@ class FileSequence(Sequence):
     def identity(self) -> dict[str, Any]:
         """Beside what all sequences have: the step, the ids that count as static, and a hash of the jitter."""
         known = super().identity() | {"step": self.step, "static_ids": list(self.static_ids)}
-        if not self.jitter:
-            return known
-        return known | {"jitter": f"{zlib.crc32(np.stack([self.jitter[n] for n in self.numbers]).tobytes()):08x}"}
+        return known | ({"jitter": fingerprint(self.jitter)} if self.jitter else {})
 
     def frame(self, number: int) -> Frame:
         """The frame with every buffer that is there; its arrays are read-only."""
