@@ -158,7 +158,7 @@ def networks() -> str:
 
 
 def scenes() -> str:
-    """How hard the embedded scenes are, means over the test seeds."""
+    """How hard the embedded scenes are, means over the development seeds."""
     found = read("experiments/results/scene_statistics.json")["scenes"]
     shares = ("hidden", "outside", "shadow", "glossy", "dynamic", "sky")
     rows = []

@@ -1,4 +1,4 @@
-"""What each part of guided_net is worth: its networks trained alike on the same windows, scored on test seeds.
+"""What each part of guided_net is worth: its networks trained alike on the same windows, scored on development seeds.
 
     python experiments/ablations.py --workdir runs --output experiments/results/ablations.json
 
@@ -8,9 +8,9 @@ scenes that neither has seen (Table 3), and what is ours: the loss, crops by err
 guess, histories at full resolution, images shown as differences, no batch norms.
 
 All variants see the same windows of training seeds, rendered once and kept in the workdir, and differ in nothing but
-what their name says; each is trained from several seeds. Scores are of the method on test seeds, mean over windows. A
-run that is there already is not trained again, so this can be stopped and gone on with, and several processes can share
-a workdir if their variants differ.
+what their name says; each is trained from several seeds. Scores are of the method on development seeds, mean over
+windows. A run that is there already is not trained again, so this can be stopped and gone on with, and several
+processes can share a workdir if their variants differ.
 """
 
 import argparse
@@ -39,7 +39,7 @@ from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
 from jaxtrapolate.ops.causes import CAUSES
 from jaxtrapolate.results import FrameScore
 from jaxtrapolate.runtime.timing import machine
-from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence
+from jaxtrapolate.scenes import DEVELOPMENT_SEEDS, SceneSequence
 from jaxtrapolate.training import Config, ExtraNetOptions, ExtraNetTask, Optimizer, train_and_evaluate
 from jaxtrapolate.training.windows import MOVING, WindowOptions
 
@@ -160,7 +160,7 @@ class Scorer:
     def __init__(self, frame: int) -> None:
         self._windows, self._compiled = [], {}
         for name in MOVING:
-            for seed in TEST_SEEDS[:4]:
+            for seed in DEVELOPMENT_SEEDS[:4]:
                 sequence = SceneSequence(name, seed, frames=frame + 1, size=SIZE)
                 (window,) = windows(sequence, [frame], past=3)
                 self._windows.append((name, window, causes_of(sequence, window)))

@@ -29,7 +29,7 @@ from jaxtrapolate.evaluation.windows import Window, arguments
 from jaxtrapolate.ops.causes import CAUSES, cause_map
 from jaxtrapolate.records import replace
 from jaxtrapolate.runtime.timing import machine
-from jaxtrapolate.scenes import TEST_SEEDS, Scene, render, scene
+from jaxtrapolate.scenes import DEVELOPMENT_SEEDS, Scene, render, scene
 from jaxtrapolate.training.windows import MOVING, scene_window
 
 SIZE = (180, 320)
@@ -89,7 +89,7 @@ def main() -> None:
     shadow: dict[str, list[float]] = {name: [] for name in METHODS}
     light = {name: {"kept": [], "steady": [], "flash": []} for name in METHODS}
     for name in options.scenes.split(","):
-        for seed in TEST_SEEDS[: options.seeds]:
+        for seed in DEVELOPMENT_SEEDS[: options.seeds]:
             world = scene(name, seed)
             for step in STEPS:
                 window = drawn(world, step)

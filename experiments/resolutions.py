@@ -2,9 +2,10 @@
 
     python experiments/resolutions.py --output experiments/results/resolutions.json
 
-Tables 5 and 6, sections 6.4 and 6.5 of Guo et al. 2021. A held-back frame of a test seed is made at 854x480, 1280x720
-and 1920x1080 by networks that were trained on frames of 320x180. Times are medians of one frame, on all cores of one
-device, and means over the scenes. `--times` or `--errors` alone do one half: times need a machine that is quiet.
+Tables 5 and 6, sections 6.4 and 6.5 of Guo et al. 2021. A held-back frame of a development seed is generated at
+854x480, 1280x720 and 1920x1080 by networks that were trained on frames of 320x180. Times are medians of one frame, on
+all cores of one device, and means over the scenes. `--times` or `--errors` alone do one half: times need a machine that
+is quiet.
 """
 
 import argparse
@@ -26,7 +27,7 @@ from jaxtrapolate.methods import Method
 from jaxtrapolate.methods.guided_net import guided_net
 from jaxtrapolate.networks.extranet import GATED_CONVOLUTION, ExtraNet, ExtraNetConfig
 from jaxtrapolate.runtime.timing import machine, measure, measure_pairs
-from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence
+from jaxtrapolate.scenes import DEVELOPMENT_SEEDS, SceneSequence
 
 SIZES = {"480p": (480, 854), "720p": (720, 1280), "1080p": (1080, 1920)}
 METHODS = ("warp", "occlusion_warp", "guided_warp", "warp_3d", "grid_extrapolate", "bidirectional", "interpolator",
@@ -39,8 +40,8 @@ GATES = {
 
 
 def window_of(scene: str, size: tuple[int, int], frame: int) -> tuple[SceneSequence, Window]:
-    """A held-back frame of a scene's first test seed, at a size."""
-    sequence = SceneSequence(scene, TEST_SEEDS[0], frames=frame + 2, size=size)
+    """A held-back frame of a scene's first development seed, at a size."""
+    sequence = SceneSequence(scene, DEVELOPMENT_SEEDS[0], frames=frame + 2, size=size)
     (window,) = windows(sequence, [frame], past=3, future=1)
     return sequence, window
 

@@ -25,7 +25,7 @@ from jaxtrapolate.metrics import Metric
 from jaxtrapolate.metrics import registry as metrics_module
 from jaxtrapolate.metrics.perceptual import ClipScore
 from jaxtrapolate.results import CauseScore, MethodResult, RunTime
-from jaxtrapolate.scenes import TEST_SEEDS, scene_names
+from jaxtrapolate.scenes import DEVELOPMENT_SEEDS, TEST_SEEDS, scene_names
 
 SIZE = (32, 48)
 
@@ -78,6 +78,7 @@ def names(texts, **options):
 
 
 def test_what_inputs_name(tmp_path):
+    assert names(["scenes:development"]) == [f"{n}-{s}" for n in scene_names() for s in DEVELOPMENT_SEEDS]
     assert names(["scenes:all"]) == [f"{n}-0" for n in scene_names()]
     assert names(["scenes:test"]) == [f"{n}-{s}" for n in scene_names() for s in TEST_SEEDS]
     assert names(["scenes:demo:7", "scenes:demo", "scenes:demo:0"]) == ["demo-7", "demo-0"]

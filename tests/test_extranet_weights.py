@@ -23,7 +23,7 @@ from jaxtrapolate.methods import extranet as module
 from jaxtrapolate.methods.extranet import RELEASE, Preparation, extranet
 from jaxtrapolate.methods.guided_net import PREPARATION
 from jaxtrapolate.records import replace
-from jaxtrapolate.scenes import TEST_SEEDS, SceneSequence
+from jaxtrapolate.scenes import DEVELOPMENT_SEEDS, SceneSequence
 
 OURS = Preparation()
 GUIDED = dataclasses.replace(RELEASE, first_guess="guided")
@@ -76,8 +76,8 @@ def test_a_network_of_our_own_is_loaded_by_its_name(model, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["walkers", "interior", "terrain"])
 def test_default_weights_are_ahead_of_their_inputs(name):
-    """On test seeds, by at least a decibel over the warp and the occlusion composite, and ahead of the guided warp."""
-    sequence = SceneSequence(name, TEST_SEEDS[1], frames=10, size=(90, 160))
+    """By at least a decibel over the warp and the occlusion composite, and ahead of the guided warp."""
+    sequence = SceneSequence(name, DEVELOPMENT_SEEDS[1], frames=10, size=(90, 160))
     methods = {m: jx.load(m) for m in ("occlusion_warp", "guided_warp", "guided_net")}
     decibels = {m: [] for m in methods}
     for window in windows(sequence, [7, 9], past=3):

@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from jaxtrapolate.records import check_frame
-from jaxtrapolate.scenes import TEST_SEEDS, TRAINING_SEEDS, SceneSequence, render, scene, scene_names, statistics
+from jaxtrapolate.scenes import (
+    DEVELOPMENT_SEEDS,
+    TEST_SEEDS,
+    TRAINING_SEEDS,
+    SceneSequence,
+    render,
+    scene,
+    scene_names,
+    statistics,
+)
 from jaxtrapolate.scenes.statistics import mean
 
 MOVING = [name for name in scene_names() if name != "still"]
@@ -25,7 +34,8 @@ def test_seeds_share_their_structure_and_differ(name):
 
 def test_test_seeds_are_no_training_seeds():
     assert len(set(TEST_SEEDS)) == len(TEST_SEEDS) >= 4
-    assert not any(seed in TRAINING_SEEDS for seed in TEST_SEEDS)
+    assert not any(seed in TRAINING_SEEDS or seed in DEVELOPMENT_SEEDS for seed in TEST_SEEDS)
+    assert not any(seed in TRAINING_SEEDS for seed in DEVELOPMENT_SEEDS)
 
 
 def test_errors():

@@ -244,6 +244,9 @@ def lit(time):
 OPTIONAL = [(name, s.name) for name in default_methods() for s in jx.load(name).stages if s.optional]
 
 
+LONG = ("guided_net", "bidirectional_guided")
+
+
 @pytest.mark.parametrize(
     ("name", "left_out"),
     [

@@ -30,7 +30,8 @@ def add_input(parser: argparse.ArgumentParser, *, several: bool = False) -> None
     """The arguments that name an input, or several."""
     if several:
         text = (
-            f"folders of frames, or embedded scenes: {SCENES}NAME[:SEED], {SCENES}all, {SCENES}test (every test seed)"
+            f"folders of frames, or embedded scenes: {SCENES}NAME[:SEED], {SCENES}all, {SCENES}test (every test seed), "
+            f"{SCENES}development (seeds that choices have looked at)"
         )
         parser.add_argument("inputs", nargs="+", metavar="INPUT", help=text)
         parser.add_argument("--size", metavar="WxH", help="of embedded scenes, width and height in pixels (320x180)")
@@ -144,12 +145,13 @@ def _resolved(text: str) -> Path:
 
 
 def _scenes(text: str) -> list[tuple[str, str]]:
-    """Names and seeds that scenes:NAME, scenes:NAME:SEED, scenes:all or scenes:test means."""
-    from jaxtrapolate.scenes import TEST_SEEDS, scene_names
+    """Names and seeds that scenes:NAME, scenes:NAME:SEED, scenes:all, scenes:development or scenes:test means."""
+    from jaxtrapolate.scenes import DEVELOPMENT_SEEDS, TEST_SEEDS, scene_names
 
     name, _, seed = text.removeprefix(SCENES).partition(":")
-    if name in ("all", "test") and not seed:
-        seeds = (0,) if name == "all" else TEST_SEEDS
+    sets = {"all": (0,), "development": DEVELOPMENT_SEEDS, "test": TEST_SEEDS}
+    if name in sets and not seed:
+        seeds = sets[name]
         return [(scene, str(seed)) for scene in scene_names() for seed in seeds]
     return [(name, seed or "0")]
 

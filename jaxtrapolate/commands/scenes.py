@@ -19,7 +19,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "scenes",
         help="the embedded scenes, and how hard they are",
-        description="Lists the embedded scenes; with --statistics it measures how hard the test seeds of them are: "
+        description="Lists the embedded scenes; with --statistics it measures how hard their development seeds are: "
         "motion, disocclusion, moving shadow and gloss between rendered frames, as a Markdown table; with --speed, how "
         "fast they are rendered here.",
     )
@@ -35,7 +35,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Runs the command."""
-    from jaxtrapolate.scenes import TEST_SEEDS, scene, scene_names, statistics
+    from jaxtrapolate.scenes import DEVELOPMENT_SEEDS, scene, scene_names, statistics
     from jaxtrapolate.scenes.statistics import mean, table
     from jaxtrapolate.scenes.worlds import SCENES
 
@@ -54,10 +54,12 @@ def run(options: argparse.Namespace) -> None:
     with progress(terminal(stderr=True)) as bar:
         if options.statistics:
             rows: dict[str, list] = {name: [] for name in names}
-            for name, seed in bar.track([(n, s) for n in names for s in TEST_SEEDS], description="statistics"):
+            for name, seed in bar.track([(n, s) for n in names for s in DEVELOPMENT_SEEDS], description="statistics"):
                 rows[name].append(statistics(scene(name, seed), size=size))
             out.print(table({name: mean(values) for name, values in rows.items()}), soft_wrap=True, highlight=False)
-            found["scenes"] = {n: dict(zip(map(str, TEST_SEEDS), map(vars, v), strict=True)) for n, v in rows.items()}
+            found["scenes"] = {
+                n: dict(zip(map(str, DEVELOPMENT_SEEDS), map(vars, v), strict=True)) for n, v in rows.items()
+            }
         if options.speed:
             speeds = {name: _speed(name, size) for name in bar.track(names, description="speed")}
             out.print("| scene | compile, s | frame, ms | frames a second |\n|---|---|---|---|", highlight=False)

@@ -9,6 +9,7 @@ from jaxtrapolate.scenes.scene import stack_scenes as stack_scenes
 from jaxtrapolate.scenes.sequence import SceneSequence as SceneSequence
 from jaxtrapolate.scenes.statistics import Statistics as Statistics
 from jaxtrapolate.scenes.statistics import statistics as statistics
+from jaxtrapolate.scenes.worlds import DEVELOPMENT_SEEDS as DEVELOPMENT_SEEDS
 from jaxtrapolate.scenes.worlds import TEST_SEEDS as TEST_SEEDS
 from jaxtrapolate.scenes.worlds import TRAINING_SEEDS as TRAINING_SEEDS
 from jaxtrapolate.scenes.worlds import scene as scene

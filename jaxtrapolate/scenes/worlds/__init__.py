@@ -31,8 +31,11 @@ SCENES: dict[str, Callable[[np.random.Generator], Scene]] = {
 TRAINING_SEEDS = range(2**31)
 """Seeds below 2^31 are for training."""
 
-TEST_SEEDS = tuple(range(2**31, 2**31 + 4))
-"""The seeds that results are reported on; training never sees them, being no `TRAINING_SEEDS`."""
+DEVELOPMENT_SEEDS = tuple(range(2**31, 2**31 + 4))
+"""Seeds that no network was trained on, but on which choices were compared: they are no test of what was chosen."""
+
+TEST_SEEDS = tuple(range(2**32, 2**32 + 4))
+"""The seeds that results are reported on: neither training nor any choice of a default has looked at them."""
 
 
 def scene_names() -> tuple[str, ...]:
@@ -43,7 +46,8 @@ def scene_names() -> tuple[str, ...]:
 def scene(name: str, seed: int = 0) -> Scene:
     """The embedded scene `name`, its layout, textures, colours, speeds, lights and camera drawn from `seed`.
 
-    Any non-negative integer is a seed; see `TRAINING_SEEDS` and `TEST_SEEDS`. All seeds share one structure.
+    Any non-negative integer is a seed; see `TRAINING_SEEDS`, `DEVELOPMENT_SEEDS` and
+    `TEST_SEEDS`. All seeds share one structure.
     """
     check_choice("name", name, scene_names())
     if seed < 0:
