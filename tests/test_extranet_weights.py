@@ -287,7 +287,7 @@ def test_known_figures_of_a_path_traced_clip(official, data):
     """The authors' weights, trained on another scene: 28.7 dB, 19.4 in exact disocclusion."""
     from jaxtrapolate.evaluation.windows import arguments, windows
     from jaxtrapolate.files import open_sequence
-    from jaxtrapolate.ops.causes import disoccluded
+    from jaxtrapolate.ops.visibility import disoccluded
 
     sequence, method = open_sequence(data / "czest1dm"), jx.load("extranet", weights=official)
     whole, holes = [], []

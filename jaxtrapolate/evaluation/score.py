@@ -14,11 +14,12 @@ from jaxtrapolate.files import Sequence, around
 from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.metrics import Metric, psnr
 from jaxtrapolate.metrics import load as load_metric
-from jaxtrapolate.ops.causes import CAUSES, cause_map, disoccluded
+from jaxtrapolate.ops.causes import CAUSES, cause_map
 from jaxtrapolate.ops.depth import surfaces_of
 from jaxtrapolate.ops.jitter import on_own_pixels
 from jaxtrapolate.ops.motion import chain_motion
 from jaxtrapolate.ops.radiance import srgb_encode, tonemap
+from jaxtrapolate.ops.visibility import disoccluded
 from jaxtrapolate.records import Frame, replace
 from jaxtrapolate.results import CauseScore, FrameScore, MethodResult, RunTime
 

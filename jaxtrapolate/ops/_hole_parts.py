@@ -12,6 +12,7 @@ from jaxtrapolate.precision import divide
 from jaxtrapolate.records import GBuffer
 
 PER_DEPTH = 1e-3  # of the depth, in the position's threshold without a unit
+_ALIKE = 3.0  # times as far apart neighbouring steps along one surface may be
 
 
 class Pair(NamedTuple):
@@ -63,7 +64,9 @@ def normal_mask(cosine: Array, concerned: Array, threshold: Any, softness: Any |
 def footprint(position: Array, bare: Array | None) -> Array:
     """The distance of each pixel's position to the nearer of its neighbours, the larger one of the two axes.
 
-    A neighbour that shows nothing, or whose position is not finite, does not count; 0 without neighbours.
+    But no more than three times the smallest step within two pixels along the axis: both neighbours of what is one
+    pixel wide lie on another surface, and the distance to them is the very gap that is looked for. A neighbour that
+    shows nothing, or whose position is not finite, does not count; 0 without neighbours.
     """
     result = None
     known = dot(position, position) < jnp.inf
@@ -75,8 +78,12 @@ def footprint(position: Array, bare: Array | None) -> Array:
         step = jnp.diff(position, axis=axis)
         whole = [jax.lax.slice_in_dim(known, k, known.shape[axis] - 1 + k, axis=axis) for k in (0, 1)]
         squared = jnp.where(whole[0] & whole[1], dot(step, step), jnp.inf)
-        first, last = (jax.lax.slice_in_dim(squared, *ends, axis=axis) for ends in ((0, 1), (-1, None)))
-        nearer = jnp.minimum(jnp.concatenate([first, squared], axis), jnp.concatenate([squared, last], axis))
+        padding = [(0, 0)] * squared.ndim
+        padding[axis] = (2, 2)
+        padded = jnp.pad(squared, padding, constant_values=jnp.inf)
+        steps = [jax.lax.slice_in_dim(padded, k, known.shape[axis] + k, axis=axis) for k in range(4)]
+        nearer, smallest = jnp.minimum(steps[1], steps[2]), jnp.minimum(steps[0], steps[3])
+        nearer = jnp.minimum(nearer, _ALIKE**2 * jnp.minimum(nearer, smallest))
         nearer = jnp.where(nearer < jnp.inf, nearer, 0)
         result = nearer if result is None else jnp.maximum(result, nearer)
     return jnp.zeros_like(position[..., :1]) if result is None else root(result)

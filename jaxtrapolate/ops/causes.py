@@ -1,59 +1,23 @@
 """Why a predicted pixel is wrong: the causes by which errors are split; the first that applies counts."""
 
-from typing import cast
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrapolate.checks import check_image, check_present
-from jaxtrapolate.ops.depth import changed, surface_depth
+from jaxtrapolate.checks import check_image
+from jaxtrapolate.ops.depth import surface_depth
 from jaxtrapolate.ops.holes import hole_masks
 from jaxtrapolate.ops.warp import backward_warp, in_frame
 from jaxtrapolate.precision import divide
-from jaxtrapolate.records import Frame, GBuffer, Keyframe, check_frame
+from jaxtrapolate.records import Frame, GBuffer, check_frame
 
 CAUSES = ("border", "hole", "shadow", "glossy", "edge", "rest")
 """The causes in the order in which they are tried; `cause_map` gives indices into this."""
 
 _SHADOW = 0.2
 _ROUGH = 0.3
-_HIDDEN = 0.02
 _JUMP = 0.05
 _REACH = 2
-
-
-@jax.jit
-def disoccluded(target: Keyframe, source: Keyframe) -> Bool[Array, "h w"]:
-    """Whether the surface at a target pixel was hidden in the source frame: exact, by depth.
-
-    The depth that the surface had in the source frame, depth + the backward flow's change, is more than 2 % beyond the
-    source's depth (bilinear) at the position that the backward flow leads to. False beyond the frame. Where one shows
-    nothing (depth that is not positive, or infinite; in the source at the pixel nearest to that position) and the other
-    a surface, it was hidden or not there; where both show nothing it was not.
-
-    Args:
-        target: with depth and backward_flow.
-        source: the I-frame before it, with depth; both in one metric unit.
-
-    Returns:
-        Bool `[H, W]`.
-
-    Raises:
-        TypeError, ValueError: a field is absent, no floating-point array, or of another size.
-    """
-    flow = check_present("target.backward_flow", target.backward_flow, needed_by="disoccluded")
-    size = check_image("target.backward_flow", flow, channels=3)
-    check_image("target.depth", target.depth, size=size, channels=1)
-    check_image("source.depth", source.depth, size=size, channels=1)
-    depth, source_depth = cast(Array, target.depth), cast(Array, source.depth)  # `check_image` has refused None
-    motion = flow[..., :2]
-    depth, source_depth = surface_depth(depth), surface_depth(source_depth)
-    expected = changed(depth, flow[..., 2:])[..., 0]
-    found, nearest = (backward_warp(source_depth, motion, filter=f)[..., 0] for f in ("bilinear", "nearest"))
-    found = jnp.where(jnp.isinf(found), nearest, found)  # of a pixel beside the silhouette
-    hidden = jnp.where(jnp.isinf(nearest), expected < jnp.inf, found < (1 - _HIDDEN) * expected)
-    return in_frame(motion) & hidden
 
 
 def _neighbours(image, reach):

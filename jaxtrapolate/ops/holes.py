@@ -19,11 +19,15 @@ from jaxtrapolate.ops._hole_parts import (
     squared_distance,
 )
 from jaxtrapolate.ops._release_holes import POSITION_THRESHOLD, release_masks
-from jaxtrapolate.ops.depth import nothing
-from jaxtrapolate.ops.warp import backward_warp, bilinear_taps, sample
+from jaxtrapolate.ops.depth import nothing, surface_depth
+from jaxtrapolate.ops.visibility import NEARER, expected_depth, planes
+from jaxtrapolate.ops.warp import backward_warp, bilinear_taps, pixel_grid, sample
+from jaxtrapolate.precision import divide
 from jaxtrapolate.records import GBuffer, check_gbuffer, record
 
 Taps = Literal["weighted", "nearest", "release"]
+
+_REMOTE = 100  # times as far as a surface: what is there is no surface that this one could be
 
 
 @record
@@ -32,7 +36,8 @@ class HoleMasks:
     """Masks `[H, W, 1]`, True (or towards 1, where softness > 0) where a warped pixel is invalid; `None` = no buffers.
 
     stencil: another dynamic object. normal: another side of one. position: another point of the static scene. depth:
-    nothing instead of a surface, or a surface instead of nothing. outside: beyond the frame.
+    nothing instead of a surface, or a surface instead of nothing; without positions also a nearer surface. outside:
+    beyond the frame.
     """
 
     stencil: Array | None = None
@@ -55,12 +60,12 @@ class HoleMasks:
 class _Bare(NamedTuple):
     """Where target and source show no surface, and the taps of the source. bool `[H, W, 1]`.
 
-    target: of the target. taps: (bare, weight) of each tap in the source. neither: the target shows nothing, nor does
-    any tap with weight.
+    target: of the target. taps: of each tap in the source, whether one of the two shows nothing, or what is as good as
+    nothing beside the other. neither: the target shows nothing, nor does any tap with weight.
     """
 
     target: Array
-    taps: list[tuple[Array, Array]]
+    taps: list[Array]
     neither: Array
 
 
@@ -81,15 +86,56 @@ def _shows_nothing(target: GBuffer, source: GBuffer) -> list[Array] | None:
     return [reduce(jnp.logical_or, side) for side in zip(*masks, strict=True)] if masks else None
 
 
-def _depth_mask(pair: Pair, sides: list[Array], dtype, taps: Taps, soft: bool) -> tuple[Array, _Bare]:
-    """One of the two shows a surface and the other nothing; and where which does."""
-    around = [(there > 0.5, weight) for there, weight in _taps_around(sides[1].astype(dtype), pair, taps)]
-    other, differs = jnp.zeros(pair.outside.shape, dtype), jnp.zeros(pair.outside.shape, bool)
-    for there, weight in around:
-        other = other + jnp.where(there != sides[0], weight.astype(dtype), 0)
-        differs |= (there != sides[0]) & (weight > 0)
+def _distances(pair: Pair, motion: Array, order: bool) -> tuple[Array, Array, Array | None]:
+    """What the taps' depths are compared by: images `[H, W, C]` of the target and of the source.
+
+    Their nearness; with `order`, of the target also the nearness that it had in the source if it moved as the frame
+    does, of the source also the plane of each pixel, as its nearness at pixel (0, 0) and its slopes.
+    """
+    here, there = (surface_depth(cast(Array, g.depth), g.sky) for g in (pair.target, pair.source))
+    here, there = (jax.lax.stop_gradient(d.astype(pair.x.dtype)) for d in (here, there))
+    near = divide(1, here, where=~(here == jnp.inf))
+    if not order:
+        return near, divide(1, there, where=~(there == jnp.inf)), None
+    then = expected_depth(here, there, motion)
+    plane = planes(there)
+    x, y = pixel_grid(*near.shape[:2], near.dtype)
+    origin = plane[..., :1] - plane[..., 1:2] * x[..., None] - plane[..., 2:] * y[..., None]
+    return near, jnp.concatenate([plane, origin], -1), divide(1, then, where=~(then == jnp.inf))
+
+
+def _depth_mask(
+    pair: Pair, motion: Array, sides: list[Array], taps: Taps, threshold, soft: bool
+) -> tuple[Array, _Bare]:
+    """One of the two shows a surface and the other nothing, or one that is nearer; and where which shows nothing.
+
+    Nearer counts where positions say nothing.
+    """
+    dtype, known = motion.dtype, pair.both("depth")
+    images, near, then = [sides[1].astype(pair.x.dtype)], None, None
+    if known:
+        near, source, then = _distances(pair, motion, order=not pair.both("position"))
+        images.append(source)
+    x, y = (jax.lax.stop_gradient(v)[..., None] for v in (pair.x, pair.y))
+    x, y = jnp.clip(x, 0, motion.shape[1] - 1), jnp.clip(y, 0, motion.shape[0] - 1)
+    other, differs, empty = jnp.zeros(pair.outside.shape, dtype), jnp.zeros(pair.outside.shape, bool), sides[0]
+    unlike = []
+    for tap, weight in _taps_around(jnp.concatenate(images, -1), pair, taps):
+        there = tap[..., :1] > 0.5
+        apart = there != sides[0]
+        empty = empty & (there | (weight <= 0))
+        if near is not None:
+            surfaces = ~there & ~sides[0]
+            least, most = jnp.minimum(near, tap[..., 1:2]), jnp.maximum(near, tap[..., 1:2])
+            apart |= surfaces & (_REMOTE * least < most)
+        unlike.append(apart)
+        if then is not None:
+            found = tap[..., 4:5] + tap[..., 2:3] * x + tap[..., 3:4] * y
+            apart |= surfaces & (found > (1 + jnp.asarray(threshold, found.dtype)) * then)
+        other = other + jnp.where(apart, weight.astype(dtype), 0)
+        differs |= apart & (weight > 0)
     mask = jnp.where(pair.outside, 0, other) if soft else differs & ~pair.outside
-    return mask, _Bare(sides[0], around, sides[0] & ~differs)
+    return mask, _Bare(sides[0], unlike, empty)
 
 
 def _stencil_mask(pair: Pair, taps: Taps, soft: bool) -> tuple[Array, Array]:
@@ -125,7 +171,7 @@ def _position_mask(pair: Pair, static, bare: _Bare | None, taps: Taps, threshold
     for k, (place, weight) in enumerate(_taps_around(cast(Array, pair.source.position), pair, taps)):
         squared = squared_distance(position, place)
         if bare is not None:
-            squared = jnp.where(bare.taps[k][0] != bare.target, jnp.inf, jnp.where(bare.target, 0, squared))
+            squared = jnp.where(bare.taps[k], jnp.inf, jnp.where(bare.target, 0, squared))
         farthest = jnp.maximum(farthest, jnp.where(weight > 0, squared, 0))
     limit = position_limit(pair, None if bare is None else bare.target, threshold)
     concerned = ~pair.outside if static is None else static & ~pair.outside
@@ -133,7 +179,9 @@ def _position_mask(pair: Pair, static, bare: _Bare | None, taps: Taps, threshold
 
 
 @partial(jax.jit, static_argnames=("taps",))
-def _hole_masks(target, source, motion, softness, normal_threshold, position_threshold, *, taps: Taps) -> HoleMasks:
+def _hole_masks(
+    target, source, motion, softness, normal_threshold, position_threshold, depth_threshold, *, taps: Taps
+) -> HoleMasks:
     """softness `None`: bool masks."""
     pair, soft = pair_of(target, source, motion), softness is not None
     outside = pair.outside.astype(motion.dtype) if soft else pair.outside
@@ -142,7 +190,7 @@ def _hole_masks(target, source, motion, softness, normal_threshold, position_thr
     depth = bare = stencil = static = normal = position = None
     sides = _shows_nothing(target, source)
     if sides is not None:
-        depth, bare = _depth_mask(pair, sides, motion.dtype, taps, soft)
+        depth, bare = _depth_mask(pair, motion, sides, taps, depth_threshold, soft)
     if pair.both("stencil"):
         stencil, static = _stencil_mask(pair, taps, soft)
     if pair.both("normal"):
@@ -161,15 +209,19 @@ def hole_masks(
     softness: float | Float[ArrayLike, ""] = 0.0,
     normal_threshold: float | Float[ArrayLike, ""] = 0.98,
     position_threshold: float | Float[ArrayLike, ""] | tuple[float, float, float] | None = None,
+    depth_threshold: float | Float[ArrayLike, ""] = NEARER,
 ) -> HoleMasks:
     """Where a frame warped along `motion` shows another surface than the target.
 
     stencil: the warped stencil is not the target's. normal: the cosine of the normals is below `normal_threshold`, on
     what the stencils do not both call static (everywhere, without stencils), and not where both show nothing. position:
     the positions are farther apart than a threshold, where the stencils are both static. depth: one shows a surface and
-    the other nothing (the sky's mask is above 0.5, or depth is infinite or not positive); positions are then infinitely
-    far apart. outside: p + motion[p] is beyond the frame. Each mask needs its buffer in both G-buffers ("depth" either
-    the sky or the depth), and is `None` without.
+    the other nothing (the sky's mask is above 0.5, or depth is infinite or not positive), or next to nothing (100 times
+    as far); positions are then infinitely far apart. Where positions are absent, also what is nearer than the surface
+    should be there: by the depth that the target would have in the source if it moved as most of the frame does
+    (`expected_depth`), which needs no cameras, and of ordinal depth its order alone. outside: p + motion[p] is beyond
+    the frame. Each mask needs its buffer in both G-buffers ("depth" either the sky or the depth), and is `None`
+    without.
 
     Args:
         target: the G-buffer of the frame to be generated.
@@ -184,9 +236,12 @@ def hole_masks(
             threshold, relative to it, over softness; the stencil's is the weight of the taps with another id.
         normal_threshold: T_n, a cosine.
         position_threshold: a number: how many times the distance between neighbouring pixels' positions (the larger of
-            the two axes), plus 0.1 % of the depth, so that it needs no unit. Or (facing, grazing, per_depth): T_d =
+            the two axes, and at most three times the smallest step within two pixels), plus 0.1 % of the depth, so that
+            it needs no unit. Or (facing, grazing, per_depth): T_d =
             facing |n_dot_v| + grazing (1 - |n_dot_v|) + per_depth * depth in the scene's unit. `None`: 2.0, but the
             release's (7.5, 45, 0.005) in centimetres for "release".
+        depth_threshold: by how much, relatively, what is found must be nearer than expected; an object that moves away
+            from the camera by more in one frame is taken for a hole.
 
     Returns:
         `HoleMasks` of `[H, W, 1]`.
@@ -196,8 +251,8 @@ def hole_masks(
         NaN depth is a surface's.
 
     Gradient:
-        Only of soft masks: with respect to motion, normals, positions, thresholds and softness; not to ids, depth and
-        sky.
+        Only of soft masks: with respect to motion, normals, positions, their thresholds and softness; not to ids, depth
+        and sky.
 
     Raises:
         TypeError, ValueError: no floating-point array, a size that differs, an unknown `taps`.
@@ -215,5 +270,6 @@ def hole_masks(
         position_threshold = POSITION_THRESHOLD if taps == "release" else 2.0
     absolute = isinstance(position_threshold, tuple | list)
     soft = not (isinstance(softness, (int, float)) and softness == 0)
-    thresholds = normal_threshold, tuple(position_threshold) if absolute else position_threshold
+    positions = tuple(position_threshold) if absolute else position_threshold
+    thresholds = normal_threshold, positions, depth_threshold
     return _hole_masks(target, source, motion, softness if soft else None, *thresholds, taps=taps)
