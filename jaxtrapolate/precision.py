@@ -35,7 +35,8 @@ def _quotient_jvp(primals, tangents):
     # JAX's own rule takes denominator^-2, which overflows from 5e-20 down, and is 0 from 2e19 up
     (numerator, denominator), (d_numerator, d_denominator) = primals, tangents
     value = _quotient(numerator, denominator)
-    return value, _quotient(d_numerator - value * d_denominator, denominator)
+    finite = jnp.where(jnp.isfinite(value), value, 0)  # one that is not has no slope, rather than one that spreads
+    return value, _quotient(d_numerator - finite * d_denominator, denominator)
 
 
 def divide(numerator: ArrayLike, denominator: Array, *, where: Array | None = None, otherwise: ArrayLike = 0) -> Array:

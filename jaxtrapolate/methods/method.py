@@ -443,6 +443,7 @@ class Method:
         """The carry before the first step; `()` for methods without memory."""
         if self.start is None:
             return ()
+        self._check(history, target, ())
         values = self.first_values((), history, target)
         return self.start(values["history"], values["target"])
 
@@ -452,7 +453,11 @@ class Method:
         """One frame, compiled: `(carry, image)`; anew only where sizes or the buffers that are there change."""
         if any(stage.host for stage in self.stages):
             return self._by_turns(carry, history, target, future)
-        return self._jitted(self.state, carry, history, target, future)
+        try:
+            return self._jitted(self.state, carry, history, target, future)
+        except TypeError:  # what is no array at all JAX refuses before any check, in words of its own
+            self._check(history, target, future)
+            raise
 
     def __call__(self, history: Frames, target: Frame, future: Frames = ()) -> Float[Array, "i j 3"]:
         """The image `[scale H, scale W, 3]`, linear radiance; for a method with memory, from a new start."""

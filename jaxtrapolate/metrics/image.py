@@ -3,6 +3,9 @@
 Both compare display values in 0..1: see `jaxtrapolate.tonemap` and `srgb_encode`.
 """
 
+from collections.abc import Sequence
+from typing import cast
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -132,18 +135,18 @@ def _moments(image: Array) -> tuple[Array, Array]:
     kernel = np.exp(-0.5 * (np.arange(-_RADIUS, _RADIUS + 1) / _SIGMA) ** 2)
     kernel = [float(w) for w in kernel / kernel.sum()]
 
-    def weighted(images, axis):
+    def weighted(images: Sequence[Array], axis: int) -> tuple[Array, Array]:
         size = images[0].shape[axis] - 2 * _RADIUS
         windows = [[jax.lax.slice_in_dim(i, k, k + size, axis=axis) for i in images] for k in range(len(kernel))]
-        means = sum(w * window[0] for w, window in zip(kernel, windows, strict=True))
+        means = cast(Array, sum(w * window[0] for w, window in zip(kernel, windows, strict=True)))
         spreads = [jnp.square(window[0] - means) + sum(window[1:]) for window in windows]
-        return means, sum(w * spread for w, spread in zip(kernel, spreads, strict=True))
+        return means, cast(Array, sum(w * spread for w, spread in zip(kernel, spreads, strict=True)))
 
     return weighted(weighted([image], 0), 1)
 
 
 def _dissimilarity(first: Array, second: Array, peak: float | Array) -> Array:
-    """1 - SSIM `[H - 10, W - 10, 1]`: of like images small, so that its mean is not rounded as one of numbers near 1."""
+    """1 - SSIM `[H - 10, W - 10, 1]`: small for like images: its mean is not rounded as one of numbers near 1."""
     wide = widest(first)
     first, second = first.astype(wide), second.astype(wide)
     peak = jnp.asarray(peak, wide)
