@@ -37,7 +37,7 @@ def errors(name: str, scenes: tuple[str, ...]) -> dict[str, dict[str, float]]:
     """By dtype the mean, the 99.9th percentile and the largest difference from float64, of all scenes together."""
     method, apart = load(name), {kind: [] for kind in KINDS}
     for scene in scenes:
-        (window,) = windows(SceneSequence(scene, SEED, frames=FRAME + 4, size=SIZE), [FRAME], past=3, future=3)
+        (window,) = windows(SceneSequence(scene, SEED, frames=FRAME + 2, size=SIZE), [FRAME], past=3, future=1)
         given = arguments(method, window)
         with jax.enable_x64(True):
             wide = jax.tree.map(lambda a: np.asarray(a, np.float64) if np.ndim(a) else a, given)
@@ -60,6 +60,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--parts", default="functions,methods,errors", help="the others are kept as they are in OUTPUT")
+    parser.add_argument("--names", default="", help="of functions and methods; the others are kept likewise")
     options = parser.parse_args()
     jaxtyping.config.update("jaxtyping_disable", True)
     result = json.loads(options.output.read_text()) if options.output.exists() else {}
@@ -68,8 +69,9 @@ def main() -> None:
     for part in ("functions", "methods"):
         if part in parts:
             cases = extreme_cases.function_cases() if part == "functions" else extreme_cases.method_cases()
-            result[part] = {}
-            for name, case in cases.items():
+            chosen = options.names.split(",") if options.names else list(cases)
+            result[part] = {} if not options.names else result[part]
+            for name, case in ((n, c) for n, c in cases.items() if n in chosen):
                 result[part][name] = extreme_cases.examine(case)
                 print(part, name, result[part][name]["reach"], flush=True)
     result["listed"] = [[*key, reason] for key, reason in extreme_cases.LISTED.items()]

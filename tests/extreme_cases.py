@@ -391,9 +391,9 @@ def reach(tree: Any, usual: Any, place: tuple[int, int]) -> int:
         spoilt = ~np.isfinite(array) & np.isfinite(other)
         if not spoilt.any():
             continue
-        if not is_image(array):
+        if array.ndim < 3 or array.shape[-2:] == (4, 4):
             return EVERYWHERE
-        rows, columns = np.nonzero(spoilt.any(-1))
+        *_, rows, columns = np.nonzero(spoilt.any(-1))  # of a run of images, in any of them
         farthest = max(farthest, int(np.abs(rows - place[0]).max()), int(np.abs(columns - place[1]).max()))
     return farthest
 
