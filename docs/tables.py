@@ -10,12 +10,13 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
-PAGES = ("docs/results.md", "docs/speed.md", "docs/scenes.md", "experiments/README.md")
+PAGES = ("docs/results.md", "docs/speed.md", "docs/scenes.md", "docs/extreme.md", "experiments/README.md")
 BLOCK = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -303,7 +304,54 @@ def stage_times() -> str:
     return table(["guided_net by stage, ms", *times], rows)
 
 
+def _extreme(part: str) -> str:
+    """Rows of extreme inputs: how many, in how many all is finite; how far one pixel that is not a number reaches."""
+    measured = read("experiments/results/extreme.json")
+
+    def far(pixels: int, name: str) -> str:
+        if name.split("-")[0] in measured["means"]:
+            return "the mean"
+        return "none" if pixels < 0 else f"{pixels}"
+
+    rows = []
+    for name, found in measured[part].items():
+        good = sum(not what for what in found["rows"].values())
+        value, gradient = (far(pixels, name) for pixels in found["reach"])
+        rows.append([f"`{name}`", f"{len(found['rows'])}", f"{good}", value, gradient])
+    return table(["", "rows", "all finite", "reach in the value, px", "in the gradient"], rows)
+
+
+def extreme_listed() -> str:
+    """What is documented not to be finite."""
+    measured = read("experiments/results/extreme.json")
+    by_reason: dict[str, dict[str, list[str]]] = {}
+    for name, row, reason in measured["listed"]:
+        by_reason.setdefault(reason, {}).setdefault(name, []).append(row)
+    rows = []
+    for reason, found in by_reason.items():
+        names: dict[tuple[str, ...], list[str]] = {}
+        for name, listed in found.items():
+            names.setdefault(tuple(listed), []).append(f"`{name}`")
+        rows += [[reason, ", ".join(cases), ", ".join(listed)] for listed, cases in names.items()]
+    return table(["what is said", "of", "in the rows"], rows)
+
+
+def extreme_errors() -> str:
+    """Errors of half precision by method."""
+    measured = read("experiments/results/extreme.json")["errors"]
+
+    def cell(found: dict[str, float]) -> str:
+        return " / ".join(f"{1000 * found[key]:.3g}" for key in ("mean", "most", "largest"))
+
+    rows = [[f"`{name}`", *map(cell, by_kind.values())] for name, by_kind in measured.items()]
+    return table(["1000 times the difference", *next(iter(measured.values()))], rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
+    "extreme-functions": partial(_extreme, "functions"),
+    "extreme-methods": partial(_extreme, "methods"),
+    "extreme-listed": extreme_listed,
+    "extreme-errors": extreme_errors,
     "search": search,
     "stiff": stiff,
     "quality": quality,

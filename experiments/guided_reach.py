@@ -3,7 +3,7 @@
     python experiments/guided_reach.py --output experiments/results/guided_reach.json
 
 A held-back frame of one training seed of each moving scene, by size: dB over the frame and in exact holes, by how many
-rows the kernels of 10 pixels are taken to suit (its option `rows`).
+rows the kernels of 9 pixels are taken to suit (its option `rows`).
 """
 
 import argparse

@@ -43,6 +43,14 @@ def check_image(name: str, value: Any, *, size: Size | None = None, channels: in
     return shape[0], shape[1]
 
 
+def check_scalar(name: str, value: Any) -> None:
+    """Raise unless `value` is a number or an array of no axes."""
+    if isinstance(value, bool) or not (isinstance(value, int | float) or hasattr(value, "dtype")):
+        raise TypeError(f"{name}: expected a number or an array of no axes, got {value!r}")
+    if np.shape(value) != ():
+        raise ValueError(f"{name}: expected shape [], got {list(np.shape(value))}")
+
+
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
     """Raise `ValueError` with the valid ones unless `value` is one of `choices`."""
     if value not in choices:

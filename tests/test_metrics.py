@@ -41,6 +41,44 @@ def test_ssim_against_skimage(size, peak):
     np.testing.assert_allclose(metrics.ssim_map(first, second, peak=peak), inner, atol=3e-5)
 
 
+def skimage_ssim(first, second):
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
+    return skimage.metrics.structural_similarity(np.float64(first), np.float64(second), channel_axis=-1, **options)
+
+
+def test_ssim_of_flat_images_is_no_rounding():
+    """The variance of a flat image is 0: means of squares less squares of means gave 1.000367."""
+    first, second = (np.full((32, 40, 3), v, np.float32) for v in (0.75, 0.74))
+    expected = (2 * 0.75 * 0.74 + 1e-4) / (0.75**2 + 0.74**2 + 1e-4)
+    assert skimage_ssim(first, second) == pytest.approx(expected, abs=1e-7)
+    np.testing.assert_allclose(metrics.ssim(jnp.asarray(first), jnp.asarray(second)), expected, atol=3e-7)
+    first, second = pair(48, 64)
+    first[:, :48], second[:, :48] = 0.75, 0.74
+    found = metrics.ssim(jnp.asarray(first), jnp.asarray(second))
+    np.testing.assert_allclose(found, skimage_ssim(first, second), atol=1e-6)
+
+
+def test_ssim_of_equal_images_is_one():
+    image = jnp.asarray(random(*SIZE, 3, low=0, high=100))
+    assert metrics.ssim(image, image) == 1
+
+
+@pytest.mark.parametrize("scale", [1e-25, 1e-3, 1e19, 1e30])
+def test_images_of_any_size(scale):
+    """Against float64; SSIM for a peak of that size."""
+    first, second = (np.float32(scale) * image for image in pair(*SIZE))
+    error = np.mean((np.float64(first) - second) ** 2)
+    arrays = jnp.asarray(first), jnp.asarray(second)
+    np.testing.assert_allclose(metrics.psnr(*arrays), -10 * np.log10(error), rtol=1e-6)
+    gradient = jax.grad(metrics.psnr)(*arrays)
+    expected = -20 / np.log(10) * (np.float64(first) - second) / (error * first.size)
+    np.testing.assert_allclose(gradient, expected, rtol=2e-3, atol=1e-6 * np.abs(expected).max())
+    expected = skimage_ssim(*(np.float64(a) / np.float64(np.float32(scale)) for a in (first, second)))
+    if scale > 1e-20:
+        np.testing.assert_allclose(metrics.ssim(*arrays, peak=scale), expected, atol=1e-5)
+    assert np.isfinite(jax.grad(metrics.ssim)(*arrays)).all()
+
+
 def test_masks_choose_the_pixels():
     first, second = pair(*SIZE)
     mask = random(*SIZE, 1, seed=4) > 0.4

@@ -9,6 +9,7 @@ import pickle
 import shutil
 import sys
 import zipfile
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -446,9 +447,21 @@ def test_damage_is_noticed(tmp_path):
             weights.load_weights(tmp_path / absent)
 
 
-def test_what_no_file_may_hold(tmp_path):
-    with pytest.raises(ValueError, match=r"expected at most 2000000"):
-        save(tmp_path, {"a": np.zeros(500_000, np.float32)})
+def test_files_may_be_larger_than_those_of_the_package(tmp_path):
+    """2 MB is what the package's own may take, and no bound for networks of others."""
+    tree = {"a": np.arange(600_000, dtype=np.float32)}
+    path = save(tmp_path, tree)
+    assert path.stat().st_size > weights.files.LARGEST_SHIPPED
+    np.testing.assert_array_equal(weights.load_weights(path).tree["a"], tree["a"])
+    for shipped in Path(weights.__file__).parent.glob("*.npz"):
+        assert shipped.stat().st_size <= weights.files.LARGEST_SHIPPED
+
+
+def test_what_no_file_may_hold(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(weights.files, "LARGEST", 1000)
+        with pytest.raises(ValueError, match=r"expected at most 1000"):
+            save(tmp_path, {"a": np.zeros(500, np.float32)})
     with pytest.raises(ValueError, match=r"a is of object"):
         save(tmp_path, {"a": np.array([None])})
     with pytest.raises(ValueError, match=r"b is of bfloat16"):
@@ -482,7 +495,7 @@ def _npy(array, pickles=False):
     return buffer.getvalue()
 
 
-def test_a_right_hash_does_not_make_weights(tmp_path):
+def test_a_right_hash_does_not_make_weights(tmp_path, monkeypatch):
     metadata = _npy(np.array(json.dumps({"method": "extranet", "config": {}, "note": ""}).encode()))
     huge = _npy(np.zeros(4, np.float32)).replace(b"(4,)", b"(9999999999999,)").replace(b" " * 13 + b"\n", b"\n")
     for content, message in (
@@ -499,8 +512,9 @@ def test_a_right_hash_does_not_make_weights(tmp_path):
         with pytest.raises(ValueError, match=message) as caught:
             weights.load_weights(_named_by_hash(tmp_path, content))
         assert "\n" not in str(caught.value)
-    with pytest.raises(ValueError, match="expected at most 2000000"):
-        weights.load_weights(_named_by_hash(tmp_path, bytes(2_000_001)))
+    monkeypatch.setattr(weights.files, "LARGEST", 1000)
+    with pytest.raises(ValueError, match="expected at most 1000"):
+        weights.load_weights(_named_by_hash(tmp_path, bytes(1001)))
 
 
 def test_default_weights(tmp_path, monkeypatch):

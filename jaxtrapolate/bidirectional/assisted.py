@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrapolate.bidirectional.search import Correspondence, check_scalar, fetch_finite, positions, within
-from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image, check_present
+from jaxtrapolate.bidirectional.search import Correspondence, fetch_finite, positions, within
+from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image, check_present, check_scalar
 from jaxtrapolate.ops.depth import held, released, surface_depth
 from jaxtrapolate.ops.strips import by_strips, once, rows_of
 from jaxtrapolate.ops.warp import Filter, all_finite, weigh

@@ -33,7 +33,6 @@ from jaxtrapolate.bidirectional.search import (
     Leads,
     advance,
     check_flow,
-    check_scalar,
     fetch_finite,
     flow_and_residual,
     leads,
@@ -44,7 +43,7 @@ from jaxtrapolate.bidirectional.search import (
     within,
 )
 from jaxtrapolate.bidirectional.starts import LatestOffsets, dual, latest
-from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_present
+from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_present, check_scalar
 from jaxtrapolate.ops.depth import held, released, surface_depth
 from jaxtrapolate.ops.strips import by_strips, once
 from jaxtrapolate.ops.warp import Filter, all_finite, inside, sample

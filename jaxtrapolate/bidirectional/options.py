@@ -10,8 +10,8 @@ from typing import Any, Literal, get_args
 import jax
 from jaxtyping import Float
 
-from jaxtrapolate.bidirectional.search import FlowFilter, Solver, check_scalar, check_search
-from jaxtrapolate.checks import ArrayLike, check_choice
+from jaxtrapolate.bidirectional.search import FlowFilter, Solver, check_search
+from jaxtrapolate.checks import ArrayLike, check_choice, check_scalar
 from jaxtrapolate.records import DepthKind
 
 Start = Literal["default", "dual", "latest"]

@@ -15,8 +15,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.bidirectional.assisted import Offsets, check_keyframe
 from jaxtrapolate.bidirectional.image_based import slim
 from jaxtrapolate.bidirectional.interpolate import interpolate_bidirectional
-from jaxtrapolate.bidirectional.search import check_scalar
-from jaxtrapolate.checks import ArrayLike
+from jaxtrapolate.checks import ArrayLike, check_scalar
 from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Keyframe
 

@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxtrapolate.checks import ArrayLike, check_choice, check_image
+from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_scalar
 from jaxtrapolate.ops.strips import by_strips, rows_of
-from jaxtrapolate.ops.warp import Filter, all_finite, inside, pixel_grid, root, sample, where_finite
+from jaxtrapolate.ops.warp import Filter, all_finite, held_motion, inside, pixel_grid, root, sample, where_finite
 from jaxtrapolate.precision import widest
 from jaxtrapolate.records import record
 
@@ -140,8 +140,8 @@ class Leads(NamedTuple):
 
 
 def leads(flow: Float[Array, "h w c"], fraction: Array) -> Leads:
-    """The `Leads` of a flow."""
-    passing = plane(jax.lax.stop_gradient(fraction * flow[..., :2]))
+    """The `Leads` of a flow; what passes of it is `held_motion`."""
+    passing = plane(jax.lax.stop_gradient(fraction * held_motion(flow[..., :2])))
     return Leads(flow, fraction, all_finite(flow), passing, only_finite(passing))
 
 
@@ -211,7 +211,7 @@ def _solve_jvp(rows, iterations, solver, filter, primals, tangents):
     at, value = by_strips(part, rows, (leads, start))  # all rows: see `by_strips`
     flow, fraction = leads.flow, leads.fraction
     known = _finite(flow) & jnp.isfinite(flow)
-    here, by_x, by_y = _slopes(jnp.where(known, flow, 0), at, filter)
+    here, by_x, by_y = _slopes(jnp.where(known, held_motion(flow), 0), at, filter)
     moved = fetch(jnp.where(known, d_flow, 0), at, filter)
     d_at = -_divide(d_fraction * here[..., :2] + fraction * moved[..., :2], by_x, by_y, fraction)
     return (at, value), (d_at, moved + by_x * d_at[..., :1] + by_y * d_at[..., 1:])
@@ -219,7 +219,7 @@ def _solve_jvp(rows, iterations, solver, filter, primals, tangents):
 
 def flow_and_residual(at, value, fraction, pixels) -> tuple[Array, Array]:
     """The whole flow at the positions found, 0 where it is not finite; and the error (eq. 7)."""
-    known = jnp.where(jnp.isfinite(value), value, 0)
+    known = jnp.where(jnp.isfinite(value), held_motion(value), 0)
     x, y = (at[..., k] + fraction * known[..., k] - pixels[..., k] for k in (0, 1))
     square = (x * x + y * y)[..., None]
     usual = square < jnp.inf
@@ -252,12 +252,6 @@ def check_flow(name: str, flow: Any, *, size: tuple[int, int] | None = None) -> 
     if flow.shape[2] not in (2, 3):
         raise ValueError(f"{name}: expected shape [H, W, 3] or [H, W, 2], got {list(flow.shape)}")
     return found
-
-
-def check_scalar(name: str, value: Any) -> None:
-    """Raise unless `value` is a number or an array of no axes."""
-    if jnp.ndim(value) != 0:
-        raise ValueError(f"{name}: expected shape [], got {list(jnp.shape(value))}")
 
 
 def check_search(*, iterations: int, solver: str, filter: str) -> None:

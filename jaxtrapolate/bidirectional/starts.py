@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxtrapolate.bidirectional.search import check_flow, check_scalar, only_finite, pair, plane, positions, scaled
-from jaxtrapolate.checks import ArrayLike, check_image
+from jaxtrapolate.bidirectional.search import check_flow, only_finite, pair, plane, positions, scaled
+from jaxtrapolate.checks import ArrayLike, check_image, check_scalar
 from jaxtrapolate.ops.depth import surface_depth
 from jaxtrapolate.ops.strips import by_strips, rows_of
 from jaxtrapolate.precision import widest

@@ -31,9 +31,7 @@ def add_parser(subparsers: Any) -> None:
         metavar="FILE.npz",
         help="where to, by default the method's name; a part of the file's hash is put into it (extranet-1a2b3c4d.npz)",
     )
-    parser.add_argument(
-        "--half", action="store_true", help="kept in float16: a file half as large; a file holds at most 2 MB"
-    )
+    parser.add_argument("--half", action="store_true", help="kept in float16: a file half as large")
     parser.add_argument("--note", metavar="TEXT", help="a line that is kept in the file: how they were trained")
     parser.set_defaults(run=run)
 

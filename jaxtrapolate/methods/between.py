@@ -12,7 +12,7 @@ from jaxtrapolate.bidirectional.flows import complete_flows
 from jaxtrapolate.methods.frames import Frames, rendered, upcoming
 from jaxtrapolate.methods.method import Stage, Values
 from jaxtrapolate.methods.stages import chain
-from jaxtrapolate.precision import widest
+from jaxtrapolate.precision import divide, widest
 from jaxtrapolate.records import Frame, Keyframe
 
 
@@ -29,7 +29,7 @@ def time_fraction(history: Frames, target: Frame, future: Frames) -> Float[Array
     if any(time is None for time in times):
         return counted
     to, whole = (jnp.asarray(times[k] - times[0]).astype(wide) for k in (1, 2))  # type: ignore[operator]
-    return jnp.where(whole != 0, to / jnp.where(whole != 0, whole, 1), counted)
+    return divide(to, whole, where=whole != 0, otherwise=counted)
 
 
 def _pair(state, values: Values):

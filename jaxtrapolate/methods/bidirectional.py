@@ -19,6 +19,7 @@ from jaxtrapolate.bidirectional.search import FlowFilter, Solver
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.between import BETWEEN, CHAINED, FRAMES, PAIR, depth_of
 from jaxtrapolate.methods.frames import rendered, upcoming
+from jaxtrapolate.methods.hindsight import block_sums, from_blocks
 from jaxtrapolate.methods.method import Method, Stage, Values
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.stages import SKY, Demodulation, chain, find_holes, reflecting
@@ -27,11 +28,9 @@ from jaxtrapolate.ops.depth import apart as depth_apart
 from jaxtrapolate.ops.depth import held
 from jaxtrapolate.ops.motion import camera_motion
 from jaxtrapolate.ops.radiance import compress, demodulate, expand, modulate
-from jaxtrapolate.ops.warp import backward_warp, in_frame, pixel_grid, sample
-from jaxtrapolate.precision import widest
+from jaxtrapolate.ops.warp import backward_warp, in_frame, pixel_grid
+from jaxtrapolate.precision import share, widest
 from jaxtrapolate.records import Frame, Keyframe, replace
-
-_BLOCK = 8  # pixels, the side of the blocks over which differences are averaged
 
 
 @settings
@@ -72,7 +71,8 @@ def _search(state, values: Values):
         Keyframe(color=next.color, depth=depth_of(next), backward_flow=between),
         depth=kind,
     )
-    first, second = (replace(frame, color=compress(frame.color)) for frame in (flows.previous, flows.next))
+    wide = widest(previous.color)
+    first, second = (replace(f, color=compress(jnp.asarray(f.color, wide))) for f in (flows.previous, flows.next))
     how = state.settings
     search = SearchOptions(
         starts=how.starts,
@@ -86,7 +86,8 @@ def _search(state, values: Values):
         test=how.visibility, depth=kind, epsilon_depth=how.epsilon_depth, epsilon_trip=how.epsilon_trip
     )
     made = interpolate_bidirectional(first, second, values["alpha"], search=search, visibility=visible).color
-    return {"image": jnp.where(made == first.color, jnp.asarray(previous.color), expand(made))}
+    color = jnp.asarray(previous.color)
+    return {"image": jnp.where(made == first.color, color, expand(made).astype(color.dtype))}
 
 
 SEARCH = Stage("search", _search, ("previous", "next", "between", "alpha"), ("image",), reads=CHAINED, fallback=True)
@@ -226,19 +227,11 @@ BLEND = Stage("blend", _blend, ("fetched", "weight"), ("image",))
 """Blends the colours of the two frames, see `mix`."""
 
 
-def _blocks(difference: Array) -> Array:
-    """Sums over blocks of pixels; as matrix products, see `hindsight`."""
-    height, width, _ = difference.shape
-
-    def member(size):
-        return (jnp.arange(size)[:, None] // _BLOCK == jnp.arange(-(-size // _BLOCK))[None]).astype(difference.dtype)
-
-    return (member(height).T @ (jnp.sum(difference, -1) @ member(width)))[..., None]
-
-
 def _apart(first: Array, second: Array, both: Array) -> Array:
-    """The squared difference of two images, tone mapped, by block; squared."""
-    return _blocks(jnp.where(both, jnp.square(compress(first) - compress(second)), 0)) ** 2
+    """The squared difference of two images, tone mapped, summed by block."""
+    wide = widest(first, second)
+    difference = compress(first.astype(wide)) - compress(second.astype(wide))
+    return block_sums(jnp.sum(jnp.where(both, jnp.square(difference), 0), -1, keepdims=True))
 
 
 def _relight(state, values: Values):
@@ -246,12 +239,10 @@ def _relight(state, values: Values):
     buffers = reflecting(values["target"].gbuffer, how.sky)
     light = [modulate(layers[..., :3], buffers, by=how.by, floor=how.floor) for layers in (first, second)]
     a, b = _apart(first[..., 3:], second[..., 3:], both), _apart(light[0], light[1], both)
-    a = a * jnp.square(jnp.asarray(how.margin, a.dtype))
-    relit = jnp.where(a + b > 0, a / jnp.where(a + b > 0, a + b, 1), 1)
+    relit = share(jnp.asarray(how.margin, a.dtype) * a, b, otherwise=1)
     height, width = both.shape[:2]
-    x, y = pixel_grid(height, width, relit.dtype)
-    x, y = (jnp.broadcast_to((v + 0.5) / _BLOCK - 0.5, (height, width)) for v in (x, y))
-    relit = sample(relit, x, y)
+    x, y = (jnp.broadcast_to(v, (height, width)) for v in pixel_grid(height, width, relit.dtype))
+    relit = from_blocks(relit, x, y)
     stands = jnp.all(first[..., 3:] == second[..., 3:], -1, keepdims=True)
     for motion in (values["to_previous"], values["to_next"]):
         stands &= jnp.all(motion == 0, -1, keepdims=True)

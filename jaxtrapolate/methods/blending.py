@@ -10,7 +10,8 @@ from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.ops.fill import fill_pyramid
 from jaxtrapolate.ops.radiance import tonemap
 from jaxtrapolate.ops.scatter import splat
-from jaxtrapolate.ops.warp import backward_warp
+from jaxtrapolate.ops.warp import backward_warp, weigh
+from jaxtrapolate.precision import divide
 
 
 @settings
@@ -54,7 +55,7 @@ def half_motion() -> Method:
 
     def function(state, values: Values):
         between = values["between"]
-        return {"image": backward_warp(values["previous"].color, values["alpha"].astype(between.dtype) * between)}
+        return {"image": backward_warp(values["previous"].color, weigh(between, values["alpha"].astype(between.dtype)))}
 
     return Method(
         "half_motion",
@@ -70,9 +71,9 @@ def _nearness(depth: Array, scale: float | Array) -> Float[Array, "h w 1"]:
     In that mean what is far hardly counts, and nothing counts as the limit of that. NaN counts as nothing.
     """
     known = depth < jnp.inf
-    inverse = jnp.where(known, 1 / jnp.where(known, depth, 1), 0)
+    inverse = divide(1, depth, where=known)
     mean = jnp.mean(inverse)
-    return -jnp.asarray(scale, depth.dtype) * jnp.where(mean > 0, mean / jnp.where(mean > 0, inverse + mean, 1), 1)
+    return -jnp.asarray(scale, depth.dtype) * divide(mean, inverse + mean, otherwise=1)
 
 
 def _likeness(own: Array, other: Array, flow: Array, scale: float | Array) -> Float[Array, "h w 1"]:
@@ -112,14 +113,14 @@ def softmax_splat() -> Method:
             ("previous", "forward", alpha, values["exponents"][0]),
             ("next", "backward", 1 - alpha, values["exponents"][1]),
         ):
-            color, motion = values[name].color, passed.astype(values[flow].dtype) * values[flow]
+            color, motion = values[name].color, weigh(values[flow], passed.astype(values[flow].dtype))
             warped = splat(color, motion, weights=weights.astype(color.dtype), mode="softmax")
             landed = splat(jnp.ones_like(color[..., :1]), motion, mode="sum")
             sides.append((warped, jnp.minimum(landed, 1)))
         (first, in_first), (second, in_second) = sides
         before, after = (1 - alpha) * in_first.astype(alpha.dtype), alpha * in_second.astype(alpha.dtype)
         covered = before + after > 0
-        weight = jnp.where(covered, after / jnp.where(covered, before + after, 1), evenly(alpha, first))
+        weight = divide(after, before + after, otherwise=evenly(alpha, first))
         return {"mixed": mix(first, second, weight), "covered": covered[..., 0]}
 
     def fill(state, values: Values):

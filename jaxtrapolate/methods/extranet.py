@@ -38,7 +38,7 @@ from jaxtrapolate.ops.depth import surface_depth
 from jaxtrapolate.ops.holes import Taps
 from jaxtrapolate.ops.radiance import By, demodulate, log_decode, log_encode
 from jaxtrapolate.ops.warp import backward_warp
-from jaxtrapolate.precision import widest
+from jaxtrapolate.precision import divide, widest
 from jaxtrapolate.records import GBuffer
 from jaxtrapolate.weights import configured, read_torch
 
@@ -110,11 +110,9 @@ def relative_depth(depth: Float[Array, "h w 1"], sky: Float[Array, "h w 1"] | No
     known = (depth > 0) & jnp.isfinite(depth)
     if sky is not None:
         known &= sky < 0.5
-    nearness = jnp.where(known, 1 / jnp.where(known, depth, 1), 0)
-    total, count = jnp.sum(nearness), jnp.sum(known.astype(depth.dtype))
-    mean = total / jnp.where(count > 0, count, 1)
-    whole = jnp.where(known, nearness + mean, 1)
-    return nearness / whole
+    nearness = divide(1, depth, where=known)
+    mean = divide(jnp.sum(nearness), jnp.sum(known.astype(depth.dtype)))
+    return divide(nearness, nearness + mean)
 
 
 def minmax_depth(depth: Float[Array, "h w 1"]) -> Float[Array, "h w 1"]:
@@ -132,11 +130,14 @@ def minmax_depth(depth: Float[Array, "h w 1"]) -> Float[Array, "h w 1"]:
 def features(buffers: GBuffer | None, like: Float[Array, "h w c"], preparation: Preparation) -> Float[Array, "h w 6"]:
     """What the network is shown of the target `[H, W, 6]`: world normal, depth, roughness, metallic.
 
-    Zeros for what is not there; size and dtype are those of `like`.
+    Zeros for what is not there, or not finite; size and dtype are those of `like`.
     """
     buffers = buffers or GBuffer()
     nothing = jnp.zeros((*like.shape[:2], 1), like.dtype)
-    normal = jnp.repeat(nothing, 3, -1) if buffers.normal is None else jnp.asarray(buffers.normal, like.dtype)
+    # held, so that no number that is not one of a unit vector's overflows in the network
+    normal = (
+        jnp.repeat(nothing, 3, -1) if buffers.normal is None else jnp.clip(buffers.normal, -1, 1).astype(like.dtype)
+    )
     if buffers.sky is not None and buffers.normal is not None:
         normal = jnp.where(buffers.sky > 0.5, preparation.sky_normal, normal)
     depth = nothing
@@ -144,7 +145,8 @@ def features(buffers: GBuffer | None, like: Float[Array, "h w c"], preparation: 
         given = jnp.asarray(buffers.depth, like.dtype)
         depth = minmax_depth(given) if preparation.depth == "minmax" else relative_depth(given, buffers.sky)
     rest = (nothing if v is None else jnp.asarray(v, like.dtype) for v in (buffers.roughness, buffers.metallic))
-    return jnp.concatenate([normal, depth, *rest], -1)
+    shown = jnp.concatenate([normal, depth, *rest], -1)
+    return jnp.where(jnp.isfinite(shown), shown, 0)  # one that is not would reach as far as the network looks
 
 
 def encode(image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:

@@ -19,15 +19,18 @@ from jaxtrapolate.methods.method import Stage, Values
 from jaxtrapolate.methods.stages import chain, reflecting
 from jaxtrapolate.ops.radiance import By, compress, demodulate, modulate
 from jaxtrapolate.ops.warp import backward_warp, landing, sample
+from jaxtrapolate.precision import share, widest
 from jaxtrapolate.records import Frame, replace
 
 _BLOCK = 8  # pixels, the side of the blocks over which errors are averaged
 
 
-def _blocks(image: Float[Array, "h w 1"]) -> Float[Array, "i j 1"]:
-    """Sums over blocks of pixels; those at the right and lower border may be smaller.
+@jax.custom_jvp
+def block_sums(image: Float[Array, "h w 1"]) -> Float[Array, "i j 1"]:
+    """Sums over blocks of 8 x 8 pixels; those at the right and lower border may be smaller.
 
-    As two matrix products: XLA does not fuse them with what makes the image, which a CPU then does in vectors.
+    As two matrix products: XLA does not fuse them with what makes the image, which a CPU then does in vectors. The
+    derivative takes sums instead, so that one that is not finite stays in its block.
     """
     height, width, _ = image.shape
 
@@ -35,6 +38,20 @@ def _blocks(image: Float[Array, "h w 1"]) -> Float[Array, "i j 1"]:
         return (jnp.arange(size)[:, None] // _BLOCK == jnp.arange(-(-size // _BLOCK))[None]).astype(image.dtype)
 
     return (member(height).T @ (image[..., 0] @ member(width)))[..., None]
+
+
+@block_sums.defjvp
+def _block_sums_jvp(primals, tangents):
+    (image,), (tangent,) = primals, tangents
+    rows, columns = (-(-size // _BLOCK) for size in image.shape[:2])
+    short = [(0, count * _BLOCK - size) for count, size in zip((rows, columns), image.shape[:2], strict=True)]
+    padded = jnp.pad(tangent[..., 0], short).reshape(rows, _BLOCK, columns, _BLOCK)
+    return block_sums(image), jnp.sum(padded, (1, 3))[..., None]
+
+
+def from_blocks(values: Float[Array, "i j 1"], x: Array, y: Array) -> Float[Array, "h w 1"]:
+    """What blocks of 8 x 8 pixels have, at positions x, y `[H, W]` of an image, bilinear between their centres."""
+    return sample(values, (x + 0.5) / _BLOCK - 0.5, (y + 0.5) / _BLOCK - 0.5)
 
 
 @partial(jax.jit, static_argnames=("by",))
@@ -63,18 +80,18 @@ def plain_share(
         floor: as of `demodulate`.
         margin: at least 0.
     """
-    truth = compress(check_present("newest.color", newest.color, needed_by="plain_share"))
+    truth = check_present("newest.color", newest.color, needed_by="plain_share")
+    truth = compress(truth.astype(widest(truth)))
     color = check_present("previous.color", previous.color, needed_by="plain_share")
     plain = backward_warp(color, motion)
     divided = backward_warp(demodulate(color, previous.gbuffer, by=by, floor=floor), motion)
 
     def error(image):
-        difference = jnp.square(compress(image) - truth)
-        return _blocks(difference[..., :1] + difference[..., 1:2] + difference[..., 2:]) ** 2
+        difference = jnp.square(compress(image.astype(truth.dtype)) - truth)
+        return block_sums(difference[..., :1] + difference[..., 1:2] + difference[..., 2:])
 
     a, b = error(plain), error(modulate(divided, newest.gbuffer, by=by, floor=floor))
-    a = a * jnp.square(jnp.asarray(margin, a.dtype))
-    return jnp.where(a + b > 0, b / jnp.where(a + b > 0, a + b, 1), 1)
+    return share(b, jnp.asarray(margin, a.dtype) * a, otherwise=1)
 
 
 def _hindsight(state, values: Values):
@@ -82,9 +99,9 @@ def _hindsight(state, values: Values):
     newest, previous = rendered(history)[:2]
     frames = (replace(history[i], gbuffer=reflecting(history[i].gbuffer, how.sky)) for i in (newest, previous))
     between = chain(history, newest, previous)
-    share = plain_share(*frames, between, by=how.by, floor=how.floor, margin=how.margin)
+    found = plain_share(*frames, between, by=how.by, floor=how.floor, margin=how.margin)
     x, y, _ = landing(motion)
-    return {"plain_share": sample(share, (x + 0.5) / _BLOCK - 0.5, (y + 0.5) / _BLOCK - 0.5)}
+    return {"plain_share": from_blocks(found, x, y)}
 
 
 HINDSIGHT = Stage(

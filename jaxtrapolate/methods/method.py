@@ -370,10 +370,8 @@ class Method:
 
     def _answer(self, image: Array, history: Frames, target: Frame) -> Array:
         """The image in the dtype that the colours had."""
-        if self.dtype is None:
-            return image
-        color = history[rendered(history)[0]].color if target.color is None else target.color
-        return image.astype(color.dtype)  # type: ignore[union-attr]
+        frame = history[rendered(history)[0]] if target.color is None else target
+        return image if self.dtype is None else image.astype(frame.color.dtype)  # type: ignore[union-attr]
 
     def _advance(self, stages, state, carry, history, target, future) -> dict[str, Any]:
         values = self.first_values(carry, history, target, future)
@@ -432,8 +430,7 @@ class Method:
         """
         if len(self.networks) != 1:
             raise ValueError(f"method {self.name!r}: expected one network, it has {', '.join(self.networks) or 'none'}")
-        (function,) = self.networks.values()
-        return partial(jax.jit(function), self.weights)
+        return partial(jax.jit(*self.networks.values()), self.weights)
 
     @cached_property
     def jitted_stages(self) -> dict[str, Callable[[Any, Values], dict[str, Any]]]:
@@ -451,9 +448,12 @@ class Method:
         self, carry: Any, history: Frames, target: Frame, future: Frames = ()
     ) -> tuple[Any, Float[Array, "i j 3"]]:
         """One frame, compiled: `(carry, image)`; anew only where sizes or the buffers that are there change."""
-        if any(stage.host for stage in self.stages):
-            return self._by_turns(carry, history, target, future)
-        return self._jitted(self.state, carry, history, target, future)
+        host = any(stage.host for stage in self.stages)
+        try:
+            return (self._by_turns if host else partial(self._jitted, self.state))(carry, history, target, future)
+        except TypeError:  # what is no array at all JAX refuses before any check, in words of its own
+            self._check(history, target, future)
+            raise
 
     def __call__(self, history: Frames, target: Frame, future: Frames = ()) -> Float[Array, "i j 3"]:
         """The image `[scale H, scale W, 3]`, linear radiance; for a method with memory, from a new start."""

@@ -20,8 +20,8 @@ from jaxtrapolate.ops.depth import changed
 from jaxtrapolate.ops.fill import fill_around
 from jaxtrapolate.ops.jitter import jitter_difference, shift_motion
 from jaxtrapolate.ops.scatter import splat_nearest
-from jaxtrapolate.ops.warp import backward_warp, in_frame
-from jaxtrapolate.precision import widest
+from jaxtrapolate.ops.warp import backward_warp, in_frame, weigh
+from jaxtrapolate.precision import divide, widest
 from jaxtrapolate.records import Frame
 
 Shade = Callable[[Frame, Bool[Array, "h w"]], Float[Array, "h w 3"]]
@@ -103,7 +103,7 @@ def steps_onward(history: Frames, target: Frame) -> Float[Array, ""]:
         return counted
     before = history[newest - 1].time if newest > 0 else None
     span = jnp.ones((), wide) if before is None else jnp.asarray(now - before).astype(wide)
-    return jnp.where(span != 0, jnp.asarray(at - now).astype(wide) / jnp.where(span != 0, span, 1), counted)
+    return divide(jnp.asarray(at - now).astype(wide), span, where=span != 0, otherwise=counted)
 
 
 def _newest(state, values: Values):
@@ -121,7 +121,7 @@ def _linear(state, values: Values):
     newest, motion = history[index], history[index].motion
     if index and (difference := jitter_difference(newest, history[index - 1])) is not None:
         motion = motion - difference.astype(motion.dtype)  # surfaces move, whatever the jitter does
-    along = -values["steps"].astype(motion.dtype) * motion
+    along = weigh(motion, -values["steps"].astype(motion.dtype))
     return {"linear": shift_motion(along, newest, target)}
 
 

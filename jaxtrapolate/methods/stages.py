@@ -14,6 +14,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxtrapolate.bidirectional.assisted import blend
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.methods.method import Stage, Values
@@ -126,7 +127,7 @@ def modulate_stage(how: Any = None) -> Stage:
             own = values["warped"][..., 3:]
             exact = backward_warp(values["newest"].color, values["motion"])
             plain = jnp.where(values["holes"] | (share < 1), own, exact)
-            image = image * (1 - share) + plain * share
+            image = blend(image, plain, share)
         return {"image": image}
 
     takes = ("warped", "target", "plain_share?", "newest", "motion", "holes")

@@ -11,6 +11,7 @@ from jaxtrapolate.ops.warp import inside, landing, root
 from jaxtrapolate.precision import divide
 from jaxtrapolate.records import GBuffer
 
+_LONGEST = 1e15  # the square of a normal's component is finite
 PER_DEPTH = 1e-3  # of the depth, in the position's threshold without a unit
 _ALIKE = 3.0  # times as far apart neighbouring steps along one surface may be
 
@@ -47,7 +48,15 @@ def softened(excess: Array, softness: Any) -> Array:
 
 
 def cosine(target: Array, warped: Array, *, unit: bool) -> tuple[Array, Array]:
-    """The cosine of two normals, and whether one of them is there; unit: they are scaled to length 1 before."""
+    """The cosine of two normals, and whether one of them is there; unit: they are scaled to length 1 before.
+
+    Not scaled, components beyond 1e15 are held there.
+    """
+    if unit:  # by the largest component first, so that no square over- or underflows
+        largest = (jax.lax.stop_gradient(jnp.max(jnp.abs(n), -1, keepdims=True)) for n in (target, warped))
+        target, warped = (divide(n, size) for n, size in zip((target, warped), largest, strict=True))
+    else:
+        target, warped = (jnp.clip(n, -_LONGEST, _LONGEST) for n in (target, warped))
     here, there = dot(target, target), dot(warped, warped)
     product = dot(target, warped)
     return divide(product, root(here * there)) if unit else product, (here > 0) | (there > 0)

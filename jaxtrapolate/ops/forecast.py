@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.ops.depth import surfaces
 from jaxtrapolate.ops.scatter import splat_nearest
-from jaxtrapolate.ops.warp import backward_warp
+from jaxtrapolate.ops.warp import backward_warp, weigh
 from jaxtrapolate.precision import widest
 from jaxtrapolate.records import Frame, GBuffer, check_frame, replace
 
@@ -40,11 +40,11 @@ def forecast(frame: Frame, fraction: float | Float[Array, ""]) -> Frame:
     frame = surfaces(frame)
     back = check_present("frame.motion", frame.motion, needed_by="forecast")
     fraction = jnp.asarray(fraction).astype(back.dtype)
-    onward = -fraction * back
+    onward = weigh(back, -fraction)
     depth = None if frame.gbuffer is None else frame.gbuffer.depth
     depth = jnp.zeros_like(back[..., :1]) if depth is None else depth
     landed, covered = splat_nearest(-onward, onward, depth)
-    motion = jnp.where(covered[..., None], landed, fraction * back)
+    motion = jnp.where(covered[..., None], landed, weigh(back, fraction))
     buffers = frame.gbuffer
     if buffers is not None:
         buffers = replace(buffers, shadow=None, sky_color=None)

@@ -17,7 +17,7 @@ from jaxtrapolate.checks import ArrayLike, check_image
 from jaxtrapolate.ops.depth import held, surface_depth
 from jaxtrapolate.ops.scatter import splat_source
 from jaxtrapolate.ops.warp import landing, pixel_grid, sample, take_rows
-from jaxtrapolate.precision import widest
+from jaxtrapolate.precision import divide, widest
 
 _STEP = 0.1  # relative: a neighbour farther by more is another surface
 _LONGEST = 2.8  # cells: drawn at two samples a pixel, a longer edge would leave gaps
@@ -112,8 +112,8 @@ def _inverse(corners: Array, target: tuple[Array, Array], start: tuple[Array, Ar
         miss_x, miss_y = _bilinear(x, u, v) - target[0], _bilinear(y, u, v) - target[1]
         determinant = x_u * y_v - y_u * x_v
         regular = jnp.abs(determinant) > 1e-6
-        safe = jnp.where(regular, determinant, 1)
-        nearer = u - (miss_x * y_v - miss_y * x_v) / safe, v - (x_u * miss_y - y_u * miss_x) / safe
+        by = miss_x * y_v - miss_y * x_v, x_u * miss_y - y_u * miss_x
+        nearer = (k - divide(d, determinant, where=regular) for k, d in zip(place, by, strict=True))
         u, v = (jnp.where(regular, jnp.clip(k, -0.5, 1.5), old) for k, old in zip(nearer, place, strict=True))
         return (u, v), None
 

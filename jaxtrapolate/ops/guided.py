@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt32
 
-from jaxtrapolate.checks import ArrayLike, check_choice, check_image
+from jaxtrapolate.checks import ArrayLike, check_choice, check_image, check_scalar
 from jaxtrapolate.ops.warp import backward_warp, landing, pixel_grid, take_rows, weigh
 from jaxtrapolate.precision import widest
 
@@ -111,8 +111,9 @@ def _blend(code, x, y, image, target, source, smaller, guide_factor, space_facto
         for k in range(source.shape[-1]):
             theirs = take_rows(rows[:, k : k + 1], index)[..., 0]
             squared = squared + jnp.square(jnp.where(used, target[..., k] - theirs, 0))
-        dx, dy = x - tap_column.astype(x.dtype), y - tap_row.astype(y.dtype)
-        apart = jnp.where(used, jnp.square(dx) + jnp.square(dy), 0)  # may be infinite where unused
+        # where unused, the square may be infinite, and its derivative
+        dx, dy = (jnp.where(used, a - b.astype(a.dtype), 0) for a, b in ((x, tap_column), (y, tap_row)))
+        apart = jnp.square(dx) + jnp.square(dy)
         return jnp.where(used, guide_factor * squared + space_factor * apart, jnp.inf)
 
     slots = 6 * jnp.arange(keep, dtype=jnp.uint32)
@@ -253,6 +254,10 @@ def guided_warp(
     check_image("target_guide", target_guide, size=size)
     check_image("source_guide", source_guide, size=size, channels=target_guide.shape[-1])
     check_choice("guides", guides, get_args(Guides))
+    for name, sigma in (("sigma_guide", sigma_guide), ("sigma_space", sigma_space)):
+        check_scalar(name, sigma)
+    if not isinstance(strides, Sequence) or not all(isinstance(s, int) for s in strides):
+        raise TypeError(f"strides: expected 1 to 7 distinct integers from 1 to 1024, as in (1, 3, 5), got {strides!r}")
     strides = tuple(strides)
     if not (1 <= len(strides) <= 7 and len(set(strides)) == len(strides) and all(1 <= s <= 1024 for s in strides)):
         raise ValueError(f"strides: expected 1 to 7 distinct integers from 1 to 1024, got {strides}")
@@ -283,7 +288,7 @@ def far_motion(
 ) -> Float[Array, "h w 2"]:
     """The motion, in holes led on to the nearest like surface further away than `guided_warp` looks.
 
-    Its kernels reach 10 pixels, which a hole of a large frame is wider than. Here the same search runs among every
+    Its kernels reach 9 pixels, which a hole of a large frame is wider than. Here the same search runs among every
     `step`-th pixel of every `step`-th row, so that it reaches that many times as far at 1 / step^2 of the cost; a hole
     whose guides differ where the motion leads goes where its block's pixel found the best tap. Ours, no paper's.
 

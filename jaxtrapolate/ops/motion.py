@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.checks import check_array, check_choice, check_image
 from jaxtrapolate.ops.depth import surface_depth
 from jaxtrapolate.ops.scatter import splat_nearest
-from jaxtrapolate.ops.warp import backward_warp, landing, take_rows
+from jaxtrapolate.ops.warp import backward_warp, held_motion, landing, take_rows
 from jaxtrapolate.precision import divide
 from jaxtrapolate.records import Camera, Sign, Units, YAxis, check_camera
 
@@ -35,7 +35,8 @@ def chain_motion(newer: Float[Array, "h w 2"], older: Float[Array, "h w 2"]) -> 
 
     Edge cases:
         `older` is interpolated bilinearly; beyond the frame its nearest border vector goes on. Motion that is not
-        finite stays so: NaN or infinite in `newer`, or in an `older` vector that has weight.
+        finite stays so: NaN or infinite in `newer`, or in an `older` vector that has weight. Longer motion than 2^30
+        pixels is held there.
 
     Gradient:
         With respect to both, as of `backward_warp`.
@@ -48,7 +49,8 @@ def chain_motion(newer: Float[Array, "h w 2"], older: Float[Array, "h w 2"]) -> 
     """
     size = check_image("newer", newer, channels=2)
     check_image("older", older, size=size, channels=2)
-    return newer + backward_warp(older, newer).astype(newer.dtype)
+    newer = held_motion(newer)
+    return newer + held_motion(backward_warp(older, newer).astype(newer.dtype))
 
 
 @partial(jax.jit, static_argnames=("sign", "units", "y_axis"))
@@ -63,7 +65,7 @@ def convert_motion(motion: Float[Array, "h w 2"], *, sign: Sign, units: Units, y
         y_axis: the direction in which y grows, "down" or "up".
 
     Returns:
-        `[H, W, 2]` pixels to add, x right, y down.
+        `[H, W, 2]` pixels to add, x right, y down; infinite where that is beyond the largest number.
 
     Raises:
         TypeError, ValueError: no floating-point array, a shape that does not fit, an option that is not listed.

@@ -110,6 +110,11 @@ def modulate(
     return irradiance * demodulation_divisor(gbuffer, by=by, floor=floor).astype(irradiance.dtype)
 
 
+def _above_zero(x: Array) -> Array:
+    """Where x is positive, and no smaller than what arithmetic holds: of less a CPU makes 0, but not in all it does."""
+    return x >= (jnp.finfo(x.dtype).smallest_subnormal if x.dtype == jnp.float16 else jnp.finfo(x.dtype).tiny)
+
+
 def _positive(x):
     """x where it is above 0, else 0 (with gradient 0, also of NaN)."""
     return jnp.where(x > 0, x, 0)
@@ -126,19 +131,28 @@ def log_encode(color: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 @jax.jit
 def log_decode(encoded: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """max(exp(y) - 1, 0), the inverse of `log_encode` for radiance that is not negative."""
-    return _positive(jnp.expm1(encoded))
+    """max(exp(y) - 1, 0), the inverse of `log_encode` for radiance that is not negative.
+
+    Of what is finite at most the largest number, with gradient 0.
+    """
+    largest = jnp.finfo(encoded.dtype).max
+    usual = encoded < jnp.log(largest).astype(encoded.dtype)
+    decoded = _positive(jnp.expm1(jnp.where(usual, encoded, 0)))
+    decoded = jnp.where(usual | jnp.isnan(encoded), decoded, largest)
+    return jnp.where(encoded == jnp.inf, jnp.inf, decoded)
 
 
 @jax.jit
 def tonemap(color: Float[Array, "*n"], *, gamma: float | Float[Array, ""] = 2.2) -> Float[Array, "*n"]:
     """(x / (1 + x))^(1 / gamma): radiance to 0..1, in which HDR images are scored and shown.
 
-    Negative values count as 0, infinity gives 1, NaN stays. The gradient at 0 is 0 (the limit from above is infinite).
+    Negative values count as 0, and so do positive ones below the smallest normal number; infinity gives 1, NaN stays.
+    The gradient at 0 is 0 (the limit from above is infinite).
     """
-    finite = jnp.where(color > 0, jnp.where(jnp.isinf(color), 1, color), 1)
+    positive = _above_zero(color)
+    finite = jnp.where(positive, jnp.where(jnp.isinf(color), 1, color), 1)
     mapped = (finite / (1 + finite)) ** (1 / jnp.asarray(gamma, color.dtype))
-    mapped = jnp.where(color > 0, jnp.where(jnp.isinf(color), 1, mapped), 0)
+    mapped = jnp.where(positive, jnp.where(jnp.isinf(color), 1, mapped), 0)
     return jnp.where(jnp.isnan(color), jnp.nan, mapped)
 
 
@@ -157,9 +171,10 @@ def compress(color: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """sqrt(x / (1 + x)): a curve near `tonemap` without powers, in which errors are compared and images blended.
 
     Linear light blended or averaged follows the brightest part, which the eye (and PSNR after a tone curve) does not.
-    Negative values and NaN count as 0. The gradient at 0 is 0 (the limit from above is infinite).
+    Negative values, NaN and positive values below the smallest normal number count as 0. The gradient at 0 is 0 (the
+    limit from above is infinite).
     """
-    usual = (color > 0) & (color < jnp.inf)
+    usual = _above_zero(color) & (color < jnp.inf)
     positive = jnp.where(usual, color, 1)
     return jnp.where(usual, jnp.sqrt(positive / (1 + positive)), jnp.where(color > 0, 1, 0).astype(color.dtype))
 

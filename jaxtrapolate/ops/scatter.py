@@ -130,10 +130,8 @@ def _splat(values, motion, weights, *, mode):
         share = (t if i else 1 - t) * (u if j else 1 - u)
         used = finite & (row + j >= 0) & (row + j < height) & (column + i >= 0) & (column + i < width)
         taps.append((jnp.where(used, (row + j) * width + column + i, count).reshape(-1), share.reshape(-1), used))
-    if mode == "linear":
-        importance = [jnp.broadcast_to(weights.astype(wide).reshape(-1), (count,))] * 4
-    elif mode == "softmax":
-        # the largest exponent at each target keeps the exponentials in range there, and drops out of the quotient
+    if mode in ("linear", "softmax"):
+        # the largest weight at each target keeps the sums in range there, and drops out of the quotient
         z = weights.astype(wide).reshape(-1)
         fixed = jax.lax.stop_gradient(z)
         largest = jnp.full(count + 1, -jnp.inf, wide)
@@ -142,9 +140,10 @@ def _splat(values, motion, weights, *, mode):
         importance = []
         for index, _, _ in taps:
             at = take_rows(largest[:, None], index)[:, 0]
+            at = jnp.where(jnp.isfinite(at), at, fixed)
             # a tap without a share may lie above the largest: its weight does not matter, but must be finite
-            excess = z - jnp.where(jnp.isfinite(at), at, fixed)
-            importance.append(jnp.exp(jnp.where(excess > 0, 0, excess)))
+            held = jnp.where(fixed > at, at, z)
+            importance.append(jnp.exp(held - at) if mode == "softmax" else divide(held, at))
     else:
         importance = [jnp.ones(count, wide)] * 4
     normalised = mode != "sum"
@@ -190,8 +189,8 @@ def splat(
 
     Edge cases:
         What lands outside the frame is lost. Non-finite motion and weights are not scattered. A pixel contributes only
-        where its share is not 0. The exponentials of "softmax" are taken relative to the largest at each target, so
-        that no size of the weights over- or underflows there.
+        where its share is not 0. Weights are taken relative to the largest at each target, so that no size of them
+        over- or underflows there.
 
     Gradient:
         With respect to values, motion and weights, exact away from kinks; at a landing position on a pixel centre, that
@@ -202,7 +201,7 @@ def splat(
             missing for a mode or given to one that has none.
 
     References:
-        Niklaus and Liu 2020 (softmax splatting), equations 4-8. Departure: the largest exponent is taken per target.
+        Niklaus and Liu 2020 (softmax splatting), equations 4-8. Departure: the largest weight is taken per target.
     """
     size = check_image("values", values)
     check_image("motion", motion, size=size, channels=2)

@@ -21,19 +21,29 @@ Filter = Literal["nearest", "bilinear", "bicubic"]
 
 Outside = Literal["edge", "zero"]
 
+_FARTHEST = 2.0**30  # pixels
+
 
 def pixel_grid(height: int, width: int, dtype=jnp.float32) -> tuple[Float[Array, "1 w"], Float[Array, "h 1"]]:
     """x `[1, W]` and y `[H, 1]` of the pixel centres; broadcast against each other they span the frame."""
     return jnp.arange(width, dtype=dtype)[None, :], jnp.arange(height, dtype=dtype)[:, None]
 
 
+def held_motion(motion: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Motion of at most 2^30 pixels, beyond all frames: positions and their squares are then finite.
+
+    What is not finite stays so. The gradient is zero beyond.
+    """
+    return jnp.where(jnp.abs(motion) < jnp.inf, jnp.clip(motion, -_FARTHEST, _FARTHEST), motion)
+
+
 def landing(motion: Float[Array, "h w 2"]) -> tuple[Float[Array, "h w"], Float[Array, "h w"], Bool[Array, "h w"]]:
     """x and y of p + motion[p], at least float32, and where that is finite; elsewhere x and y are p itself.
 
-    The gradient is zero where the motion is not finite.
+    The motion is `held_motion`. The gradient is zero where it is not finite.
     """
     height, width, _ = motion.shape
-    motion = motion.astype(widest(motion))
+    motion = held_motion(motion.astype(widest(motion)))
     finite = jnp.isfinite(motion[..., 0]) & jnp.isfinite(motion[..., 1])
     x, y = pixel_grid(height, width, motion.dtype)
     return x + jnp.where(finite, motion[..., 0], 0), y + jnp.where(finite, motion[..., 1], 0), finite
@@ -88,7 +98,7 @@ def _plain(value, weight):
 def weigh(value: Array, weight: Array) -> Array:
     """value * weight, but 0 where the weight is 0, even of a NaN or an infinity.
 
-    The derivative with respect to the weight is the value where that is finite, also at weight 0; else 0 there.
+    The derivative with respect to the weight is the value where that is finite, also at weight 0; else 0.
     """
     return jnp.where(weight == 0, 0, value * weight)
 
@@ -96,7 +106,7 @@ def weigh(value: Array, weight: Array) -> Array:
 @weigh.defjvp
 def _weigh_jvp(primals, tangents):
     (value, weight), (d_value, d_weight) = primals, tangents
-    used = jnp.where((weight == 0) & ~jnp.isfinite(value), 0, value)
+    used = jnp.where(jnp.isfinite(value), value, 0)
     return weigh(value, weight), used * d_weight + d_value * weight
 
 

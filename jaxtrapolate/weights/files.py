@@ -23,10 +23,10 @@ from jaxtrapolate.files.text import check_values
 from jaxtrapolate.regular import open_regular
 from jaxtrapolate.weights.tree import named, nested
 
-LARGEST = 2_000_000
-"""Bytes: no file of weights is larger."""
-LARGEST_CHECKPOINT = 1 << 28
-"""Bytes: no Orbax checkpoint is read whose arrays take more, or whose files do."""
+LARGEST_SHIPPED = 2_000_000
+"""Bytes: no file of weights that comes with the package is larger."""
+LARGEST = 1 << 28
+"""Bytes: no file of weights is written or read that is larger, nor an Orbax checkpoint whose arrays or files are."""
 _METADATA = "__metadata__"
 _ORBAX = "_METADATA"  # the file that every pytree saved by Orbax has
 _NAME = re.compile(r"(?P<stem>.+)-(?P<hash>[0-9a-f]{8})\.npz")
@@ -80,7 +80,7 @@ def save_weights(
 
     Raises:
         InputError: the folder does not exist or cannot be written to.
-        ValueError: two arrays with one name, one that holds no numbers, a note of several lines, or more than 2 MB.
+        ValueError: two arrays with one name, one that holds no numbers, a note of several lines, or more than 256 MB.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in named(tree).items()}
     nested(arrays)
@@ -104,7 +104,7 @@ def load_weights(path: str | PathLike[str]) -> Weights:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: one line that names the file: a name without a hash, another hash, more than 2 MB, or no weights.
+        ValueError: one line that names the file: a name without a hash, another hash, more than 256 MB, or no weights.
     """
     path, source = Path(path), printable(path)
     with open_regular(path) as file:
@@ -157,8 +157,8 @@ def load_orbax(directory: str | PathLike[str]) -> Weights:
         handler = ocp.PyTreeCheckpointHandler()
         stated = handler.metadata(epath.Path(item))
         sizes = [_bytes(leaf) for leaf in jax.tree.leaves(getattr(stated, "tree", stated))]
-        if sum(sizes) > LARGEST_CHECKPOINT:
-            raise ValueError(f"claims arrays of {sum(sizes)} bytes, at most {LARGEST_CHECKPOINT} are read")
+        if sum(sizes) > LARGEST:
+            raise ValueError(f"claims arrays of {sum(sizes)} bytes, at most {LARGEST} are read")
         kinds = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), stated)
         tree = handler.restore(epath.Path(item), args=ocp.args.PyTreeRestore(restore_args=kinds))
         handler.close()
@@ -183,8 +183,8 @@ def _check_files(folder: Path, source: str) -> None:
             if not stat.S_ISREG(mode) and (not stat.S_ISDIR(mode) or os.path.islink(path)):
                 raise ValueError(printable(f"{source}: damaged Orbax checkpoint ({name} is no regular file)"))
             total += os.path.getsize(path) if stat.S_ISREG(mode) else 0
-    if total > LARGEST_CHECKPOINT:
-        raise ValueError(f"{source}: an Orbax checkpoint of {total} bytes, at most {LARGEST_CHECKPOINT} are read")
+    if total > LARGEST:
+        raise ValueError(f"{source}: an Orbax checkpoint of {total} bytes, at most {LARGEST} are read")
 
 
 def _bytes(leaf: Any) -> int:
