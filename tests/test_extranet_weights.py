@@ -198,7 +198,8 @@ def test_commands_take_weights(capsys, dump, saved, tmp_path):
     assert code == 0
     results = json.loads((tmp_path / "a" / "results.json").read_text())
     assert set(results["methods"]) == {"repeat", "extranet"}
-    assert set(results["settings"]["weights"]) == {"extranet"}
+    record = json.loads((tmp_path / "a" / "run.json").read_text())
+    assert record["parts"]["weights"] == {"extranet": weights.fingerprint(jx.load("extranet", weights=saved).weights)}
     assert "network" in results["methods"]["extranet"]["stages"]
     folder = tmp_path / "made"
     code, _, err = run(
