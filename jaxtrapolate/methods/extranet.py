@@ -248,13 +248,16 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
         image = log_decode(first + correction)
         guess, own = values["warped"][..., :3], values["warped"][..., 3:]  # the colour as it is, where hindsight asks
         if share is not None:  # of the guess 1 - share is left, of its correction 1 - share^2
-            image = guess + (1 + share) * (image - guess)
-            image = jnp.where(image > 0, image, 0)
+            known = jnp.all(jnp.isfinite(values["warped"]), -1, keepdims=True)
+            share, own = jnp.where(known, share, 0), jnp.where(known, own, 0)
+            onward = guess + (1 + share) * (image - guess)
+            image = jnp.where(known, jnp.where(onward > 0, onward, 0), image)
         motions = values["motions"]
         if len(motions) > 1:  # with one rendered frame it is not known whether anything changes
             still = standing([source.color for source in values["sources"]], *motions)
             image = jnp.where(still, values["histories"][0].astype(image.dtype), image)
-        return {"warped": jnp.concatenate([image, own.astype(image.dtype)], -1), "image": image, "guess": guess}
+        warped = jnp.concatenate([image, own.astype(image.dtype)], -1)
+        return {"warped": warped, "image": image, "guess": guess, "plain_share": share}
 
     def sky(state, values: Values):
         image = values["image"]
@@ -276,7 +279,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
             "network",
             network,
             takes=("inputs", "sources", "motions", "histories", "warped", "plain_share?"),
-            gives=("warped", "image", "guess"),
+            gives=("warped", "image", "guess", "plain_share"),
         ),
         modulate_stage(preparation),
         Stage(
