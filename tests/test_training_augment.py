@@ -9,7 +9,8 @@ from synthetic import make_frame
 
 import jaxtrapolate as jx
 from jaxtrapolate.evaluation.windows import Window, hide
-from jaxtrapolate.training.augment import crop, flip
+from jaxtrapolate.records import replace
+from jaxtrapolate.training.augment import brighten, crop, flip
 
 SIZE = (9, 14)
 FLIPS = [(True, False), (False, True), (True, True)]
@@ -205,3 +206,19 @@ def test_a_weighted_crop_holds_what_has_weight():
     left = (cut == [2, 4]).all(-1).any((1, 2))
     assert (left | (cut == [8, 4]).all(-1).any((1, 2))).all()
     assert 0.65 < left.mean() < 0.85
+
+
+def test_lamps_shine_as_lamps_do():
+    """By a loop; what is not bright stays bit for bit, the hue of what is stays, and nothing is beyond the most."""
+    color = np.float32([[[0.2, 3.9, 1.0], [8.0, 2.0, 0.0]], [[14.0, 7.0, 3.5], [1e5, 1.0, 1.0]]])
+    frame = jx.Frame(jnp.asarray(color), motion=jnp.zeros((2, 2, 2)))
+    found = brighten((frame, replace(frame, color=None)), 3.0)
+    expected = np.float64(color)
+    expected[0, 1] *= (8 / 4) ** 3
+    expected[1, 0] *= (14 / 4) ** 3
+    np.testing.assert_allclose(found[0].color, expected, rtol=1e-5)
+    np.testing.assert_array_equal(found[0].color[0, 0], color[0, 0])
+    assert found[1].color is None
+    np.testing.assert_array_equal(brighten(frame, 0.0).color, color)
+    most = brighten(frame, 8.0).color[1, 0]
+    np.testing.assert_allclose(most, [3e4, 1.5e4, 7.5e3], rtol=1e-5)

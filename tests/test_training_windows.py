@@ -396,3 +396,38 @@ def test_bare_windows_have_depth_and_stencil_alone(monkeypatch, share):
 
     made = Windows(WindowOptions(size=(4, 5), bare=share), prepare, past=1).pool(jax.random.key(0), range(100))
     assert abs(np.asarray(made).mean() - share) <= (0.15 if 0 < share < 1 else 0)
+
+
+def test_sparse_windows_lack_one_kind_of_buffer_and_lamps_shine(monkeypatch):
+    """In all their frames alike, each kind now and then; and what is bright is brighter in some windows."""
+    names = ("albedo", "depth", "normal", "stencil", "position", "roughness", "metallic", "sky")
+    frame = jx.Frame(color=jnp.full((4, 5, 3), 8.0), motion=jnp.zeros((4, 5, 2)),
+                     gbuffer=jx.GBuffer(**{name: jnp.ones((4, 5, 1)) for name in names}))  # fmt: skip
+    window = Window(number=0, truth=frame, history=(frame,), target=hide(frame), future=())
+    monkeypatch.setattr(Windows, "_draw", lambda *_: ("walkers", jax.tree.map(lambda a: jnp.asarray(a)[None], window)))
+
+    def prepare(window, key):
+        lacks = {tuple(n for n in names if getattr(f.gbuffer, n) is None)
+                 for f in (window.truth, window.history[0], window.target)}  # fmt: skip
+        assert len(lacks) == 1
+        kinds = [
+            (),
+            ("albedo",),
+            ("depth",),
+            ("normal",),
+            ("stencil",),
+            ("position",),
+            ("roughness", "metallic"),
+            ("sky",),
+        ]
+        kind = jnp.float32(kinds.index(lacks.pop()))
+        return jnp.stack([kind, window.truth.color[0, 0, 0], window.history[0].color[0, 0, 0]])
+
+    options = WindowOptions(size=(4, 5), sparse=0.7, lamps=0.5)
+    made = np.asarray(Windows(options, prepare, past=1).pool(jax.random.key(0), range(200)))
+    assert set(made[:, 0]) == set(range(8))
+    assert abs((made[:, 0] > 0).mean() - 0.7) < 0.12
+    assert abs((made[:, 1] > 8).mean() - 0.5) < 0.12
+    assert made[:, 1].min() == 8
+    assert made[:, 1].max() > 500
+    np.testing.assert_array_equal(made[:, 1], made[:, 2])

@@ -17,8 +17,9 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_choice
 from jaxtrapolate.errors import printable
-from jaxtrapolate.methods.frames import rendered
+from jaxtrapolate.methods.hindsight import hindsight_stage
 from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.options import settings
 from jaxtrapolate.methods.stages import (
     COMPOSITE,
     OCCLUSION,
@@ -26,11 +27,13 @@ from jaxtrapolate.methods.stages import (
     composite,
     demodulate_stage,
     holes_stage,
+    margin,
     modulate_stage,
     reflecting,
     reproject_stage,
 )
 from jaxtrapolate.methods.warping import GUIDED, Guide
+from jaxtrapolate.networks.explained import explained, standing
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig, extranet_from_torch
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.networks.stored import load_network
@@ -173,12 +176,19 @@ def encoded_truth(
     return encode(color)
 
 
+@settings
+class Correction(Guide):
+    """Of the guided warp that makes the first guess, and of hindsight."""
+
+    margin: float = margin()
+
+
 def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
     def function(state, values: Values):
         warped = [encode(image) for image in values["histories"]]
-        first = encode(values["warped"])
+        first = encode(values["warped"][..., :3])
         valid = [1 - mask.astype(first.dtype) for mask in values["masks"]]
-        guesses = [first, encode(composite(values, values["layers"][0], outside=preparation.outside))]
+        guesses = [first, encode(composite(values, values["layers"][0][..., :3], outside=preparation.outside))]
         sources = [jnp.concatenate(pair, -1) for pair in zip(warped, valid, strict=True)]
         sources = [sources[min(k, len(sources) - 1)] for k in range(config.histories)]
         inputs = {
@@ -199,9 +209,11 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
     oldest is repeated. The network sees x `[H, W, 6]` (the first guess and the occlusion composite), mask `[H, W, 1]`,
     features `[H, W, 6]` and history `[3, H, W, 4]`, oldest first, all in the log domain: these are `values["inputs"]`
     of the stages before "network". Its answer is decoded and modulated. The sky is the engine's where it draws it
-    apart, else that of the newest frame, warped as the first guess is. Where nothing moves and all rendered frames are
-    equal, in the whole frame, the newest is the result. Its options are those of the guided warp, where that makes the
-    first guess; all else that could be set was set when the network was trained.
+    apart, else that of the newest frame, warped as the first guess is. Outside holes the network's correction is held
+    within what its inputs differ by (`explained`), and where nothing moves and all rendered frames are equal, tile by
+    tile, the newest is the result (`standing`). Where the guided warp makes the first guess, hindsight mixes in that of
+    the colour as it is: of the guess 1 - share is left and of the network's correction 1 - share^2. The options are
+    then those of the guided warp, and of hindsight; all else that could be set was set when the network was trained.
 
     What a scene lacks is left out: no albedo, no demodulation; no depth, no occlusion motion, the composite is the
     warp; normal, depth, roughness or metallic that are absent are zeros; masks are those that the buffers allow.
@@ -227,18 +239,28 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
     def warp(state, values: Values):
         pairs = zip(values["layers"], values["motions"], strict=True)
         warped = tuple(backward_warp(image, motion, outside=preparation.outside) for image, motion in pairs)
-        return {"histories": warped, "warped": warped[0]}
+        return {"histories": tuple(image[..., :3] for image in warped), "warped": warped[0]}
 
     def network(state, values: Values):
-        inputs = values["inputs"]
-        image = log_decode(function(state.weights, *(inputs[name] for name in ("x", "mask", "features", "history"))))
-        history, motions = values["history"], values["motions"]
+        inputs, share = values["inputs"], values["plain_share"]
+        answer = function(state.weights, *(inputs[name] for name in ("x", "mask", "features", "history")))
+        first, *others = jnp.split(inputs["x"], config.warps, -1)
+        if inputs["history"] is not None:
+            others += list(inputs["history"][..., :3])
+        correction = explained(answer - first, (first, *others), free=inputs["mask"] < 0.5)
+        image = log_decode(first + correction)
+        guess, own = values["warped"][..., :3], values["warped"][..., 3:]  # the colour as it is, where hindsight asks
+        if share is not None:  # of the guess 1 - share is left, of its correction 1 - share^2
+            known = jnp.all(jnp.isfinite(values["warped"]), -1, keepdims=True)
+            share, own = jnp.where(known, share, 0), jnp.where(known, own, 0)
+            onward = guess + (1 + share) * (image - guess)
+            image = jnp.where(known, jnp.where(onward > 0, onward, 0), image)
+        motions = values["motions"]
         if len(motions) > 1:  # with one rendered frame it is not known whether anything changes
-            colors = [history[i].color for i in rendered(history)][: len(motions)]
-            same = [jnp.all(color == colors[0]) for color in colors[1:]]
-            still = jnp.all(jnp.stack(same + [jnp.all(motion == 0) for motion in motions]))
+            still = standing([source.color for source in values["sources"]], *motions)
             image = jnp.where(still, values["histories"][0].astype(image.dtype), image)
-        return {"warped": image, "image": image, "guess": values["warped"]}
+        warped = jnp.concatenate([image, own.astype(image.dtype)], -1)
+        return {"warped": warped, "image": image, "guess": guess, "plain_share": share}
 
     def sky(state, values: Values):
         image = values["image"]
@@ -251,6 +273,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
         reproject_stage(past),
         dataclasses.replace(OCCLUSION, optional=True),
         holes_stage(preparation.taps, position_threshold=preparation.position_threshold),
+        *((hindsight_stage(preparation),) if guided else ()),
         demodulate_stage(preparation),
         Stage("warp", warp, ("layers", "motions"), ("histories", "warped")),
         *guided,
@@ -258,8 +281,8 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
         Stage(
             "network",
             network,
-            takes=("inputs", "history", "motions", "histories", "warped"),
-            gives=("warped", "image", "guess"),
+            takes=("inputs", "sources", "motions", "histories", "warped", "plain_share?"),
+            gives=("warped", "image", "guess", "plain_share"),
         ),
         modulate_stage(preparation),
         Stage(
@@ -272,7 +295,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
         ),
         SKY,
     )
-    given = Guide() if guided else ()
+    given = Correction() if guided else ()
     return Method(name, stages, past=past, weights=weights, settings=given, networks={"network": function})
 
 

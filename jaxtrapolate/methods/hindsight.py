@@ -8,6 +8,7 @@ there is carried along the motion to the target.
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -94,23 +95,32 @@ def plain_share(
     return share(b, jnp.asarray(margin, a.dtype) * a, otherwise=1)
 
 
-def _hindsight(state, values: Values):
-    history, motion, how = values["history"], values["motion"], state.settings
-    newest, previous = rendered(history)[:2]
-    frames = (replace(history[i], gbuffer=reflecting(history[i].gbuffer, how.sky)) for i in (newest, previous))
-    between = chain(history, newest, previous)
-    found = plain_share(*frames, between, by=how.by, floor=how.floor, margin=how.margin)
-    x, y, _ = landing(motion)
-    return {"plain_share": from_blocks(found, x, y)}
+def hindsight_stage(how: Any = None) -> Stage:
+    """Adds "plain_share", carried along the motion to the target's grid; `margin` is an option of the method.
+
+    Args:
+        how: has by, floor and sky, as of `demodulate_stage`.
+    """
+
+    def function(state, values: Values):
+        history, given = values["history"], how or state.settings
+        newest, previous = rendered(history)[:2]
+        frames = (replace(history[i], gbuffer=reflecting(history[i].gbuffer, given.sky)) for i in (newest, previous))
+        between = chain(history, newest, previous)
+        found = plain_share(*frames, between, by=given.by, floor=given.floor, margin=state.settings.margin)
+        x, y, _ = landing(values["motion"])
+        return {"plain_share": from_blocks(found, x, y)}
+
+    return Stage(
+        "hindsight",
+        function,
+        takes=("history", "motion"),
+        gives=("plain_share",),
+        reads=("history.albedo", "target.albedo", "newest.motion", "before_newest.motion"),
+        optional=True,
+        past=2,
+    )
 
 
-HINDSIGHT = Stage(
-    "hindsight",
-    _hindsight,
-    takes=("history", "motion"),
-    gives=("plain_share",),
-    reads=("history.albedo", "target.albedo", "newest.motion", "before_newest.motion"),
-    optional=True,
-    past=2,
-)
+HINDSIGHT = hindsight_stage()
 """Adds "plain_share", carried along the motion to the target's grid."""

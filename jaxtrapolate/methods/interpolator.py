@@ -5,10 +5,12 @@ from collections.abc import Mapping
 from os import PathLike
 from typing import Any
 
+import jax.numpy as jnp
 from flax import nnx
 
 from jaxtrapolate.methods.between import PAIR
 from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.networks.explained import standing
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.networks.interpolator import Interpolator, InterpolatorConfig
 from jaxtrapolate.networks.stored import load_network
@@ -25,6 +27,7 @@ def interpolator(model: Interpolator) -> Method:
 
     The network sees the frames before and after through `compress`, as values of a display, and the target's time
     between them: `values["inputs"]` is `(first, second, time)`. Pixels that are not finite count as black or white.
+    Where the two are equal, tile by tile, they are the result (`standing`).
 
     References: of the kind of Kong et al. 2022 (IFRNet), see `jaxtrapolate.networks.interpolator` for what differs.
     """
@@ -35,12 +38,14 @@ def interpolator(model: Interpolator) -> Method:
         return {"inputs": (first, second, values["alpha"].astype(first.dtype))}
 
     def network(state, values: Values):
-        return {"image": expand(function(state.weights, *values["inputs"]))}
+        image = expand(function(state.weights, *values["inputs"]))
+        first, second = (values[name].color for name in ("previous", "next"))
+        return {"image": jnp.where(standing((first, second)), first.astype(image.dtype), image)}
 
     stages = (
         PAIR,
         Stage("inputs", inputs, ("previous", "next", "alpha"), ("inputs",)),
-        Stage("network", network, ("inputs",), ("image",)),
+        Stage("network", network, ("inputs", "previous", "next"), ("image",)),
     )
     return Method(_NAME, stages, kind="interpolation", future=1, weights=weights, networks={"network": function})
 

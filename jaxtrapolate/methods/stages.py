@@ -26,6 +26,11 @@ from jaxtrapolate.ops.warp import backward_warp
 from jaxtrapolate.records import Frame, GBuffer, replace
 
 
+def margin() -> Any:
+    """The option of hindsight."""
+    return option(2.0, "how much better the undivided colour must agree to make up half", low=0, high=1000)
+
+
 @settings
 class Demodulation:
     """How colours are divided by the reflectance."""
@@ -33,7 +38,7 @@ class Demodulation:
     by: By = option("albedo+specular", "what the colour is divided by before it is warped", choices=By)
     floor: float = option(0.01, "the smallest divisor", low=0, high=1)
     sky: bool = option(True, "whether the sky's colour is warped undivided; else its albedo counts")
-    margin: float = option(2.0, "how much better the undivided colour must agree to make up half", low=0, high=1000)
+    margin: float = margin()
 
 
 def chain(frames: Sequence[Frame], first: int, last: int, *, before: Array | None = None) -> Array:

@@ -4,7 +4,8 @@ From IFRNet (Kong et al. 2022): one pyramid of features for both frames; decoder
 the level's features by the flow so far and refine it together with a feature of the frame between; a blend mask and a
 residual at the end; the mean subtracted from the input. Ours: decoders of four layers at the pyramid's widths, pixel
 shuffles in place of transposed convolutions, and time built in: a flow is a velocity times the time to be bridged, the
-mask tilts a linear blend, and the residual fades, so that at times 0 and 1 the result is the frame itself.
+mask tilts a linear blend, and the residual fades, so that at times 0 and 1 the result is the frame itself. The
+residual is held within what the two warped frames differ by (`explained`).
 """
 
 import dataclasses
@@ -19,6 +20,7 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_array
 from jaxtrapolate.networks.blocks import HE, Layer, pad_to_multiple, pixel_shuffle, upsample_2x
+from jaxtrapolate.networks.explained import explained
 from jaxtrapolate.ops.warp import landing, sample
 from jaxtrapolate.precision import widest
 
@@ -147,5 +149,6 @@ class Interpolator(nnx.Module):
         code = code.astype(wide)
         mask, residual = jax.nn.sigmoid(jnp.clip(code[..., 4:5], -10, 10)), code[..., 5:]
         far = later * (1 - mask) / (earlier * mask + later * (1 - mask))
-        image = a * (1 - far) + b * far + 4 * earlier * later * residual
+        held = jax.vmap(lambda residual, *warped: explained(residual, warped))(residual, a, b)
+        image = a * (1 - far) + b * far + 4 * earlier * later * held
         return image[:, :height, :width].astype(first.dtype)

@@ -1,4 +1,4 @@
-"""Augmentation: mirrored frames, whose world is mirrored with them, and random crops."""
+"""Augmentation: mirrored frames, whose world is mirrored with them, lamps as bright as real ones, and random crops."""
 
 from typing import Any, TypeVar
 
@@ -75,6 +75,32 @@ def _flip(frame: Frame, horizontal: Flag, vertical: Flag) -> Frame:
             projection=None if projection is None else projection * screen[:, None] * screen[None],
         )
     return replace(frame, **fields)
+
+
+def brighten(tree: T, power: float | Float[Array, ""], *, above: float = 4.0, most: float = 3e4) -> T:
+    """Let what shines brightly in all `Frame`s of a pytree shine as lamps do.
+
+    Radiance whose largest channel p is over `above` is multiplied by (p / above)^power, up to `most`; all other stays
+    bit for bit, and so does radiance that is beyond that anyway. It is a function of the radiance alone, so that what
+    moves looks the same in every frame.
+
+    Args:
+        tree: a `Frame`, a `Window`, or any pytree that holds such; leading axes of colours are free.
+        power: 0 changes nothing.
+        above, most: radiances, 0 < above < most.
+    """
+
+    def one(value: Any) -> Any:
+        if not isinstance(value, Frame) or value.color is None:
+            return value
+        color = jnp.asarray(value.color)
+        peak = jnp.max(color, -1, keepdims=True)
+        bright = (peak > above) & (peak < most)
+        peak = jnp.where(bright, peak, above)
+        gain = jnp.minimum(jnp.exp(jnp.asarray(power, color.dtype) * jnp.log(peak / above)), most / peak)
+        return replace(value, color=color * jnp.where(bright, gain, 1))
+
+    return jax.tree.map(one, tree, is_leaf=lambda value: isinstance(value, Frame))
 
 
 def crop(tree: T, key: PRNGKeyArray, *, size: Size, weight: Float[Array, "h w 1"] | None = None) -> T:

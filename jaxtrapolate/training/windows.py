@@ -23,7 +23,7 @@ from jaxtrapolate.evaluation.windows import Window, hide, load
 from jaxtrapolate.files import Sequence, around, open_sequence, runs
 from jaxtrapolate.records import Frame, GBuffer, replace
 from jaxtrapolate.scenes import TRAINING_SEEDS, Scene, render, scene, scene_names, stack_scenes
-from jaxtrapolate.training.augment import flip
+from jaxtrapolate.training.augment import brighten, flip
 from jaxtrapolate.training.config import check_range
 from jaxtrapolate.training.tasks import Example
 
@@ -58,6 +58,9 @@ class WindowOptions:
             "direct" = exact motion from one rendered frame to the next, without the frames between.
         flip: how likely a window is mirrored left to right, and top to bottom.
         bare: the share of windows that are shown with colour, motion, depth and stencil alone, as many engines write.
+        sparse: the share of windows from which one kind of buffer, drawn at random, is left out: albedo, normals,
+            positions, materials, depth, stencil or sky. Of bare ones too.
+        lamps: the share of windows in which what shines brightly shines as lamps do, up to 3e4; see `brighten`.
         together: how many windows in a row are of one scene; accelerators render these at once.
         dumps: folders of frames with all buffers, see `jaxtrapolate.files.open_sequence`. The last tenth of each one's
             windows is for validation.
@@ -72,6 +75,8 @@ class WindowOptions:
     motion: MotionPath = "chained"
     flip: tuple[float, float] = (0.5, 0.0)
     bare: float = 0.0
+    sparse: float = 0.0
+    lamps: float = 0.0
     together: int = 1
     dumps: tuple[str, ...] = ()
     dumps_share: float = 0.5
@@ -90,8 +95,8 @@ class WindowOptions:
         if not all(0 <= p <= 1 for p in self.flip):
             raise ValueError(f"flip: expected two probabilities, got {list(self.flip)}")
         check_range(self, "together", least=1)
-        check_range(self, "bare", least=0, most=1)
-        check_range(self, "dumps_share", least=0, most=1)
+        for name in ("bare", "sparse", "lamps", "dumps_share"):
+            check_range(self, name, least=0, most=1)
         if not (self.dumps if self.dumps_share == 1 else self.scenes):
             raise ValueError(f"{'dumps' if self.dumps_share == 1 else 'scenes'}: expected some, got none")
 
@@ -149,13 +154,24 @@ def scene_window(
     )
 
 
-def _bare(window: Window) -> Window:
-    """The window without the buffers of its frames but depth and stencil."""
+_BARE = tuple(f.name for f in dataclasses.fields(GBuffer) if f.name not in ("depth", "stencil"))
+
+_KINDS = (
+    *(("albedo",), ("normal",), ("position", "n_dot_v"), ("roughness", "metallic", "specular")),
+    *(("depth",), ("stencil",), ("sky", "sky_color")),
+)
+"""Buffers that an engine writes together or not at all."""
+
+_POWER = 8.0  # of `brighten`: what shines at 12 is at its limit
+
+
+def _without(window: Window, names: tuple[str, ...]) -> Window:
+    """The window without some of its frames' buffers."""
 
     def strip(node: Any) -> Any:
         if not isinstance(node, Frame) or node.gbuffer is None:
             return node
-        return replace(node, gbuffer=GBuffer(depth=node.gbuffer.depth, stencil=node.gbuffer.stencil))
+        return replace(node, gbuffer=replace(node.gbuffer, **dict.fromkeys(names)))
 
     return jax.tree.map(strip, window, is_leaf=lambda node: isinstance(node, Frame))
 
@@ -289,7 +305,11 @@ class Windows:
         else:
             name, windows = self._draw(rng, count, VALIDATION_SEEDS if validation else SEEDS)
         if options.bare and rng.random() < options.bare:
-            windows = _bare(windows)
+            windows = _without(windows, _BARE)
+        if options.sparse and rng.random() < options.sparse:
+            windows = _without(windows, _KINDS[rng.integers(len(_KINDS))])
+        if options.lamps and rng.random() < options.lamps:
+            windows = brighten(windows, rng.uniform(0, _POWER))
         try:
             return self._prepare(windows, *flips, keys)
         except ValueError as error:
