@@ -169,7 +169,7 @@ def composite(
 def find_holes(
     target: GBuffer | None, source: GBuffer | None, motion: Array, *, taps: Taps = "nearest", **options
 ) -> Array:
-    """The union `[H, W, 1]` of all hole masks that the buffers allow, by the pixel nearest to the landing place.
+    """The union `[H, W, 1]` of all hole masks that the buffers allow, by the pixel nearest to where the motion leads.
 
     Judged by all four bilinear taps, every pixel beside a silhouette would be a hole as well. Options as of
     `hole_masks`.
