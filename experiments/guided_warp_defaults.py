@@ -42,7 +42,7 @@ def scene_scores(name: str, seed: int, times: list[int], size: tuple[int, int]) 
         truth = display(window.truth.color, hdr=True)
         newest, target = window.history[-1], window.target
         irradiance = jx.demodulate(newest.color, newest.gbuffer)
-        mine, theirs = guides(target.gbuffer, newest.gbuffer)
+        mine, theirs = guides(target.gbuffer, newest.gbuffer, target.motion)
         for (guide, space), scores in grid.items():
             warped = jx.guided_warp(irradiance, target.motion, mine, theirs, sigma_guide=guide, sigma_space=space)
             image = display(jx.modulate(warped, target.gbuffer), hdr=True)

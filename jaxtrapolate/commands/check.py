@@ -19,6 +19,7 @@ from jaxtrapolate.files import SETTINGS_NAME, MotionConvention, Sequence, gaps, 
 from jaxtrapolate.methods import method_names
 from jaxtrapolate.methods.frames import buffer
 from jaxtrapolate.ops.ego_motion import camera_matrix, off_camera, static_ids
+from jaxtrapolate.ops.holes import possible_masks
 from jaxtrapolate.ops.jitter import shift_motion
 from jaxtrapolate.ops.motion import convert_motion
 from jaxtrapolate.ops.warp import backward_warp
@@ -277,6 +278,8 @@ def _print_buffers(scan: Scan, out: Console) -> None:
     absent = [n for n in ("color", "motion", *CHANNELS) if n not in scan.buffers]
     if absent:
         out.print(f"absent: {', '.join(absent)}", soft_wrap=True)
+    if "motion" in scan.buffers:
+        out.print(possible_masks([n for n in CHANNELS if n in scan.buffers]), soft_wrap=True)
 
 
 def _print_objects(sequence: Sequence, scan: Scan, out: Console) -> None:

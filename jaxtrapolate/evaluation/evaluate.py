@@ -24,6 +24,8 @@ from jaxtrapolate.methods import Method, default_methods
 from jaxtrapolate.methods import load as load_method
 from jaxtrapolate.metrics import Metric
 from jaxtrapolate.metrics import load as load_metric
+from jaxtrapolate.ops.holes import lacking_masks, possible_masks
+from jaxtrapolate.records import CHANNELS, GBuffer
 from jaxtrapolate.results import FrameScore, MethodResult, MetricInfo, Results, RunTime
 from jaxtrapolate.runtime.output import code
 from jaxtrapolate.runtime.timing import machine
@@ -337,6 +339,10 @@ class Evaluation:
             notes.append(f"each method is scored at the size of its own output: {text}")
         if sequence.depth == "ordinal":
             notes.append("depth is only ordered, not a distance: holes are found by the hole masks")
+        buffers = self.sequence.frame(self.numbers[0]).gbuffer or GBuffer()
+        there = [n for n in CHANNELS if getattr(buffers, n) is not None]
+        if lacking_masks(there):
+            notes.append(possible_masks(there))
         return notes
 
 

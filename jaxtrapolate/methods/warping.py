@@ -19,7 +19,9 @@ from jaxtrapolate.methods.stages import (
     demodulate_stage,
     modulate_stage,
 )
+from jaxtrapolate.ops.depth import held, surface_depth
 from jaxtrapolate.ops.guided import far_motion, guided_warp
+from jaxtrapolate.ops.visibility import expected_depth
 from jaxtrapolate.ops.warp import Filter, backward_warp
 
 
@@ -72,6 +74,8 @@ def occlusion_warp() -> Method:
 
 
 _GUIDES = ("albedo", "normal")
+_INSTEAD = ("stencil", "depth")
+_LOGARITHM = 2.0  # of the depth as a guide: with the default sigma, 1.5 % of the depth is one sigma
 
 
 @settings
@@ -83,7 +87,7 @@ class Guide:
     )
     keep: int = option(4, "how many of the most similar pixels are blended", low=1, high=33)
     strides: tuple[int, ...] = option((1, 3, 5, 9), "of the kernels of 3 x 3 pixels, in pixels", low=1, high=64)
-    sigma_guide: float = option(0.03, "of the Gaussian of the guides' difference (albedo, normal)", low=0)
+    sigma_guide: float = option(0.03, "of the Gaussian of the guides' difference (see `guides`)", low=0)
     sigma_space: float = option(0.5, "of the Gaussian of the distance on the screen, in pixels", low=0)
     unlike: float = option(0.1, "squared difference of guides from which on a hole is led further off", low=0)
 
@@ -93,15 +97,26 @@ class GuidedSettings(Guide, Demodulation):
     """Of demodulation and of the guided warp."""
 
 
-def guides(target, source):
-    """The guides `[H, W, G]` of both frames: albedo and normal, those that both have; else the stencil."""
-    names = [n for n in _GUIDES if getattr(target, n) is not None and getattr(source, n) is not None] or ["stencil"]
-    return tuple(jnp.concatenate([getattr(g, n) for n in names], -1) for g in (target, source))
+def guides(target, source, motion):
+    """The guides `[H, W, G]` of both frames: albedo and normal, those that both have; else stencil and depth, likewise.
+
+    Of depth it is twice the logarithm, so that it has no unit; the target's is the depth that its surfaces are expected
+    to have in the source (`expected_depth`).
+    """
+    both = [n for n in (*_GUIDES, *_INSTEAD) if getattr(target, n) is not None and getattr(source, n) is not None]
+    names = [n for n in both if n in _GUIDES] or both
+    first, second = ([getattr(g, n) for n in names if n != "depth"] for g in (target, source))
+    if "depth" in names:
+        depths = (surface_depth(jnp.asarray(g.depth), g.sky) for g in (target, source))
+        then, there = next(depths), next(depths)
+        then = expected_depth(then, there, motion)
+        first, second = ([*a, _LOGARITHM * jnp.log(held(d))] for a, d in ((first, then), (second, there)))
+    return tuple(jnp.concatenate(a, -1) for a in (first, second))
 
 
 def guides_of(role: str) -> str:
     """What a stage reads that compares the target with the frames of a role by `guides`: one that both have."""
-    return "|".join(f"target+{role}.{name}" for name in (*_GUIDES, "stencil"))
+    return "|".join(f"target+{role}.{name}" for name in (*_GUIDES, *_INSTEAD))
 
 
 def fetch_guided(image, motion, holes, target, source, how: Any):
@@ -110,7 +125,7 @@ def fetch_guided(image, motion, holes, target, source, how: Any):
     From twice that many rows on, holes are first led to a like surface by a coarse search (`far_motion`); `None` leaves
     that out. how: a `Guide`.
     """
-    target_guide, source_guide = guides(target, source)
+    target_guide, source_guide = guides(target, source, motion)
     step = motion.shape[0] // (how.rows or motion.shape[0])
     if step > 1:
         motion = far_motion(motion, target_guide, source_guide, holes, step=step, unlike=how.unlike)

@@ -78,13 +78,7 @@ def _cause_map(target, source, motion, hidden, metric) -> Int[Array, "h w"]:
     here, there = target.gbuffer or GBuffer(), source.gbuffer or GBuffer()
     no = jnp.zeros((*motion.shape[:2], 1), bool)
     border = ~in_frame(motion)[..., None]
-    if hidden is None:
-        masks = hole_masks(here, there, motion)
-        hidden = jnp.any(
-            jnp.stack([m for m in (masks.stencil, masks.normal, masks.position) if m is not None] + [no]), 0
-        )
-    else:
-        hidden = hidden[..., None]
+    hidden = hole_masks(here, there, motion, taps="nearest").any if hidden is None else hidden[..., None]
     shadow = glossy = no
     if here.shadow is not None and there.shadow is not None:
         shadow = jnp.abs(here.shadow - backward_warp(there.shadow, motion)) > _SHADOW
@@ -117,7 +111,8 @@ def cause_map(
         target: the ground truth, with its shadow.
         source: the rendered frame that is warped.
         motion: from target to source.
-        hidden: the exact holes (`disoccluded`); without it the union of the `hole_masks` that the buffers allow.
+        hidden: the exact holes (`disoccluded`); without it the union of the `hole_masks` that the buffers allow, by
+            the nearest pixel.
         metric_depth: whether depth is a distance, or only ordered.
 
     Returns:

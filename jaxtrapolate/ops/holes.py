@@ -1,6 +1,7 @@
 """Hole masks: which pixels of a warped frame show another surface than the target (Guo et al. 2021, section 5.2)."""
 
 import dataclasses
+from collections.abc import Collection
 from functools import partial, reduce
 from typing import Literal, NamedTuple, cast, get_args
 
@@ -274,3 +275,21 @@ def hole_masks(
     positions = tuple(position_threshold) if absolute else position_threshold
     thresholds = normal_threshold, positions, depth_threshold
     return _hole_masks(target, source, motion, softness if soft else None, *thresholds, taps=taps)
+
+
+_NEEDS = {"stencil": "stencil", "normal": "normal", "position": "position", "depth": "depth or sky"}
+
+
+def lacking_masks(buffers: Collection[str]) -> list[str]:
+    """The hole masks that cannot be made where both frames have no more than these buffers, and what they need."""
+    return [f"{n} (needs {what})" for n, what in _NEEDS.items() if not set(what.split(" or ")) & set(buffers)]
+
+
+def possible_masks(buffers: Collection[str]) -> str:
+    """One line: which hole masks can be made where both frames have these buffers of a `GBuffer`, and which cannot."""
+    lacking = lacking_masks(buffers)
+    made = [name for name in _NEEDS if not any(text.startswith(f"{name} ") for text in lacking)]
+    if "depth" in buffers and "position" not in buffers:
+        made[made.index("depth")] = "depth (nearer surfaces, since there is no position)"
+    line = "hole masks: by " + ", ".join([*made, "the frame's edge"])
+    return f"{line}; not by {', '.join(lacking)}" if lacking else line
