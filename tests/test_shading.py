@@ -124,6 +124,7 @@ def test_holes_have_no_weight():
     assert not np.any(none[0])
 
 
+@pytest.mark.slow
 def test_a_flow_back_that_misses_is_not_trusted():
     """A shadow appears: nothing of it was there."""
     newer, older = shadow(STEP), np.full_like(shadow(STEP), 0.65)
@@ -134,6 +135,7 @@ def test_a_flow_back_that_misses_is_not_trusted():
     assert np.all(np.asarray(tight) <= np.asarray(loose) + 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("finest", [0, 2])
 def test_other_resolutions(finest):
     newer, older = pair()
@@ -142,7 +144,9 @@ def test_other_resolutions(finest):
     assert difference(made, truth, edge) < 0.5 * difference(newer, truth, edge)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (6, 1), (5, 7), (33, 17)])
+@pytest.mark.parametrize(
+    "size", [(1, 1), (5, 7), *(pytest.param(s, marks=pytest.mark.slow) for s in ((1, 7), (6, 1), (33, 17)))]
+)
 def test_every_size(size):
     rng = np.random.default_rng(0)
     newer, older, guide = (rng.uniform(size=(*size, c)).astype(np.float32) for c in (3, 3, 2))
@@ -164,6 +168,7 @@ def test_half_precision_is_computed_in_float32():
         np.testing.assert_array_equal(a, b.astype(jnp.bfloat16))
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_differences(x64):
     """In float64, against central differences along a direction: with respect to images, guide and numbers."""
     crop = (slice(20, 44), slice(50, 80))
