@@ -28,8 +28,12 @@ SCENES = ("terrain", "windmill", "walkers", "street", "interior", "dock", "fores
 VARIANTS = {
     "shading": {},
     "no guide": {"guide": None},
+    "holes count": {"valid": None},
     "sigma 0.1": {"sigma_guide": 0.1},
     "sigma 0.5": {"sigma_guide": 0.5},
+    "sigma 1": {"sigma_guide": 1.0},
+    "sigma 1 gain 0.5": {"sigma_guide": 1.0, "least_gain": 0.5},
+    "no guide gain 0.5": {"guide": None, "least_gain": 0.5},
     "full size": {"finest": 0},
     "quarter": {"finest": 2},
     "reach 2": {"reach": 2},
@@ -61,9 +65,15 @@ def images(window, options: dict[str, dict]) -> dict[str, jnp.ndarray]:
     first, second = fetched(newer, motion), fetched(older, far)
     flow = jx.dis_flow(*(jnp.mean(image, -1, keepdims=True) for image in (first, second)))
     found = {"guided": made(first), "flow everywhere": made(jx.backward_warp(first, flow / 2))}
-    normal = target.gbuffer.normal
+    normal, valid = target.gbuffer.normal, None
+    if normal is not None:
+        holes = [
+            jx.hole_masks(target.gbuffer, f.gbuffer, m).any.reshape(normal.shape[:2])
+            for f, m in ((newer, motion), (older, far))
+        ]
+        valid = ~(holes[0] | holes[1])
     for name, given in options.items():
-        flow, confidence = jx.shading_flow(first, second, **({"guide": normal} | given))
+        flow, confidence = jx.shading_flow(first, second, **({"guide": normal, "valid": valid} | given))
         moved = jx.backward_warp(first, flow / 2)
         found[name] = made(first + confidence * (moved - first))
     return found

@@ -102,7 +102,8 @@ def inverse_search_flow(
         first, second = (apart(resize(a, smaller, kind="area")) for a in (first, second))
         guidance = None if guidance is None else guidance.resized(smaller)
         images.append((first, second, guidance))
-    flow = jnp.zeros(sizes[-1], jnp.result_type(first.dtype, jnp.complex64))
+    zero = jnp.zeros(sizes[-1], first.dtype)
+    flow = jax.lax.complex(zero, zero)
     for (first, second, level), shape in reversed(list(zip(images, sizes, strict=True))[finest:]):
         flow = enlarged(flow, shape)
         weight, edges = (None, None) if level is None else (level.of_patches(effort.stride), level.of_neighbours())

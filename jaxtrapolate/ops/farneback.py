@@ -38,16 +38,16 @@ def _expansion(image, radius: int, sigma: float):
     g = gaussian(2 * radius + 1, sigma)
     x, y = np.meshgrid(at, at)
     basis = np.stack([np.ones_like(x), x, y, x * x, y * y, x * y], -1).reshape(-1, 6)
-    inverse = np.linalg.inv(basis.T @ (np.outer(g, g).reshape(-1, 1) * basis))
+    inverse = np.linalg.inv(basis.T @ (np.outer(g, g).reshape(-1, 1) * basis)).tolist()
     padded = bordered(image, radius, 0)
     smooth, slope, bend = (bordered(window(padded, g * at**k, 0), radius, 1) for k in (0, 1, 2))
     mean = window(smooth, g, 1)
     return (
-        apart(window(slope, g, 1) * inverse[2, 2]),
-        apart(window(smooth, g * at, 1) * inverse[1, 1]),
-        apart(mean * inverse[4, 0] + window(bend, g, 1) * inverse[4, 4]),
-        apart(mean * inverse[3, 0] + window(smooth, g * at**2, 1) * inverse[3, 3]),
-        apart(window(slope, g * at, 1) * inverse[5, 5]),
+        apart(window(slope, g, 1) * inverse[2][2]),
+        apart(window(smooth, g * at, 1) * inverse[1][1]),
+        apart(mean * inverse[4][0] + window(bend, g, 1) * inverse[4][4]),
+        apart(mean * inverse[3][0] + window(smooth, g * at**2, 1) * inverse[3][3]),
+        apart(window(slope, g * at, 1) * inverse[5][5]),
     )
 
 

@@ -104,7 +104,7 @@ def patches(first: Float[Array, "h w"], stride: int, weight: Float[Array, "8 8 n
     images = jnp.stack([first, *(gradient(first, axis) for axis in (1, 0))])
     grey, x, y = jax.vmap(partial(cut, stride=stride))(images)
     count = total(jnp.ones_like(grey))
-    x, y = (a - divide(total(a), count) for a in (x, y))
+    x, y = (a - divide(total(a), count)[None, None] for a in (x, y))
     xx, xy, yy = total(x * x), total(x * y), total(y * y)
     more = _DAMPING * (xx + yy) + _FLAT
     xx, yy = xx + more, yy + more
@@ -232,8 +232,8 @@ def densify(
 
     def row(given):
         upper, lower, grey, weight = given
-        above, below = ((1 - tx) * a[:-1] + tx * a[1:] for a in (upper, lower))
-        apart = (1 - ty) * above + ty * below - grey
+        above, below = ((1 - tx)[None] * a[:-1] + tx[None] * a[1:] for a in (upper, lower))
+        apart = (1 - ty)[None] * above + ty[None] * below - grey
         like = 1 / jnp.maximum(1, jnp.abs(apart))
         return like if weight is None else like * weight
 

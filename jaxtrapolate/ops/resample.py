@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Inexact
 
 from jaxtrapolate.checks import Size
 from jaxtrapolate.ops.warp import sample
@@ -115,7 +115,7 @@ def resize(image: Float[Array, "h w"], size: Size, *, kind: str = "linear") -> F
     return resample(image, Resampling(height, size[0], kind), Resampling(width, size[1], kind))
 
 
-def apart(image: Float[Array, "h w"]) -> Float[Array, "h w"]:
+def apart(image: Inexact[Array, "h w"]) -> Inexact[Array, "h w"]:
     """The image, computed once: XLA on a CPU computes what several consumers read in each of them, and fuses a window
     with what it slides over; what a loop reads it computes before."""
 
