@@ -19,7 +19,10 @@ def size_of(name: str) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Inputs:
-    """float32 `[H, W, C]` arrays of NumPy; motion leads from the target frame to the source frame."""
+    """float32 `[H, W, C]` arrays of NumPy; motion leads from the target frame to the source frame.
+
+    gray and moved_gray, 0..1, are of a texture that the motion leads from the one to the other.
+    """
 
     image: np.ndarray
     motion: np.ndarray
@@ -28,6 +31,8 @@ class Inputs:
     importance: np.ndarray
     target_guide: np.ndarray
     source_guide: np.ndarray
+    gray: np.ndarray
+    moved_gray: np.ndarray
 
 
 def make_inputs(height: int, width: int, *, seed: int = 0) -> Inputs:
@@ -67,6 +72,10 @@ def make_inputs(height: int, width: int, *, seed: int = 0) -> Inputs:
     there = x + motion[..., 0], y + motion[..., 1]
     waves = np.stack([np.sin(0.11 * x * k + 0.07 * y) * np.cos(0.05 * y * k) for k in (1.0, 1.7, 2.3)], -1)
     image = 0.5 + 0.3 * waves + 0.1 * random.uniform(size=waves.shape)
+
+    def texture(x, y):
+        return 0.5 + sum(0.12 * np.sin(k * (0.11 * x + 0.07 * y)) * np.cos(k * 0.05 * y) for k in (1.0, 1.7, 2.3))
+
     arrays = {
         "image": image,
         "motion": motion,
@@ -75,5 +84,7 @@ def make_inputs(height: int, width: int, *, seed: int = 0) -> Inputs:
         "importance": -depth,
         "target_guide": guide(*there, ahead),
         "source_guide": guide(x, y, front(x - shift[0], y - shift[1])),
+        "gray": texture(*there)[..., None],
+        "moved_gray": texture(x, y)[..., None],
     }
     return Inputs(**{name: np.ascontiguousarray(a, np.float32) for name, a in arrays.items()})

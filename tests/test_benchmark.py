@@ -66,7 +66,7 @@ def test_all_operations_without_peers(operations, tmp_path, monkeypatch, capsys)
 @pytest.mark.parametrize(
     "module, names",
     [
-        ("cv2", "warp bilinear,warp nearest,bicubic,chain"),
+        ("cv2", "warp bilinear,warp nearest,bicubic,chain,farneback,dis"),
         ("scipy", "warp bilinear,warp nearest,chain"),
         ("torch", "warp bilinear,warp nearest,bicubic"),
         ("numba", "bicubic,softmax,occlusion,search,warp float32"),

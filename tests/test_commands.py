@@ -356,10 +356,10 @@ def test_brackets_are_printed(capsys):
         "frames": [1],
         "metrics": {},
         "methods": {"warp": {"psnr": 30.0, "ms": {"median": 1.0, "compile": None}, "by_cause": {}}},
-        "skipped": {"dis": 'pip install "jaxtrapolate[flow]"'},
+        "skipped": {"sharp": 'pip install "jaxtrapolate[flip]"'},
         "notes": ["[a]"],
     }
     print_table(Results.from_json(results), terminal())
     out = capsys.readouterr().out
-    for text in ("clip[final]", '"jaxtrapolate[flow]"', "note: [a]"):
+    for text in ("clip[final]", '"jaxtrapolate[flip]"', "note: [a]"):
         assert text in out

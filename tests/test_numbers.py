@@ -172,7 +172,7 @@ def test_mistakes_end_in_a_line_of_the_librarys_own(unchecked):
     with pytest.raises(ValueError, match=r"fraction: expected shape \[\], got \[2\]"):
         jx.iterative_search(motion, jnp.ones(2))
     frame = jx.Frame(color=image, motion=motion)
-    for name in ("warp", "extranet"):
+    for name in ("warp", "guided_net"):
         method = jx.load(name)
         with pytest.raises(TypeError, match=r"history\[0\]: expected a Frame, got"):
             method((image,), frame)

@@ -156,8 +156,6 @@ def test_options_are_swept_and_fitted():
     ],
 )
 def test_options_count(name, options):
-    if name == "dis":
-        pytest.importorskip("cv2")
     method = jx.load(name)
     if method.future:
         history, target, future = between()
@@ -207,7 +205,7 @@ def test_what_is_cast():
     assert newest.motion.dtype == np.float32
 
 
-@pytest.mark.parametrize("name", [n for n in jx.method_names() if n not in ("dis", *NETWORKS)])
+@pytest.mark.parametrize("name", [n for n in jx.method_names() if n not in NETWORKS])
 def test_every_method_in_bfloat16(unchecked, name, strict):
     """No buffer of one dtype meets one of another unawares."""
     method = jx.load(name, dtype="bfloat16")

@@ -15,7 +15,7 @@ from jaxtrapolate.methods import neighbours
 from jaxtrapolate.records import CHANNELS, Camera, Frame, GBuffer, Keyframe
 
 SIZE = (8, 12)
-NAMES = sorted(set(jx.method_names()) - {"dis"})  # that one runs on the host, and reads colours alone
+NAMES = sorted(jx.method_names())
 NETWORKS = ("guided_net", "extranet", "interpolator")
 BUFFERS = ("albedo", "depth", "normal", "position", "specular", "metallic", "stencil", "sky", "sky_color")
 

@@ -89,6 +89,7 @@ frames = [synthetic.make_frame(k, SIZE) for k in range(2)]
 keyframes = [replace(synthetic.make_keyframe(k, SIZE), time=None) for k in range(3)]
 image, motion, buffers = frames[0].color, frames[0].motion, frames[0].gbuffer
 depth, stencil = buffers.depth, buffers.stencil
+gray = image[..., :1]
 eye = np.eye(4, dtype=np.float32)
 moved = np.stack([eye] * 2)
 
@@ -144,6 +145,9 @@ MORE = {
         lambda a, b, c, d: jx.overlay(jx.interpolate_assisted(a, b, b, 0.4), c, d, d[..., 0] > 5),
         *(*keyframes[:2], image, depth),
     ),
+    "farneback_flow": (jx.farneback_flow, gray, gray[::-1]),
+    "dis_flow": (jx.dis_flow, gray, gray[::-1]),
+    "shading_flow": (lambda a, b, g: jx.shading_flow(a, b, guide=g, round_trip=1.0), image, image[::-1], image),
     "fill_pyramid": (lambda i: fill.fill_pyramid(i, i[..., 0] > 0.5), image),
     "fill_around": (lambda i, d: fill.fill_around(i, i[..., 0] > 0.5, depth=d), image, depth),
     "grid_warp": (lambda i, f, d: grid.grid_warp(i, f, d, 0.5), image, motion, depth),
@@ -227,6 +231,9 @@ NUMBERS = {
     "far_motion": lambda: guided.far_motion(motion, image, image, stencil > 0, step=2, unlike=STRONG),
     "demodulate": lambda: radiance.demodulate(image, buffers, floor=STRONG),
     "tonemap": lambda: radiance.tonemap(image, gamma=STRONG),
+    "shading_flow": lambda: jx.shading_flow(
+        *(image, image), sigma_guide=STRONG, least_gain=STRONG, least_change=STRONG, round_trip=STRONG
+    ),
     "psnr": lambda: metrics.psnr(image, image, peak=STRONG),
     "ssim": lambda: metrics.ssim(image, image, peak=STRONG),
     "hole_masks": lambda: holes.hole_masks(
@@ -300,10 +307,7 @@ def given(found, *, times=float, dtype=np.float32):
     return tuple(sequence[5 - past : 5]), sequence[5], tuple(sequence[6 : 6 + future])
 
 
-TRACED = [name for name in jx.method_names() if name != "dis"]
-
-
-@pytest.mark.parametrize("name", TRACED)
+@pytest.mark.parametrize("name", jx.method_names())
 def test_methods_keep_float32(unchecked, name):
     """Also with times in float64."""
     found = method(name)
@@ -320,7 +324,7 @@ def test_methods_keep_float32(unchecked, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", "bfloat16", "float16"])
-@pytest.mark.parametrize("name", TRACED)
+@pytest.mark.parametrize("name", jx.method_names())
 def test_methods_in_other_precisions(unchecked, name, dtype):
     """A network answers in at least float32, all else in the precision of the frames."""
     found = method(name)

@@ -1,0 +1,207 @@
+"""The motion of light over surfaces: optical flow between two images of the same surfaces.
+
+Motion vectors follow surfaces; shadows and highlights move over them. Once two older frames are warped to one raster by
+motion vectors and divided by what the surfaces reflect, all that still differs between them is light.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxtrapolate.checks import ArrayLike, check_image
+from jaxtrapolate.ops.dis import Effort, Guidance, inverse_search_flow, level_sizes, like
+from jaxtrapolate.ops.fill import check_mask, fill_pyramid
+from jaxtrapolate.ops.refinement import Weights, shifted
+from jaxtrapolate.ops.resample import apart, fetch, resize
+from jaxtrapolate.ops.warp import pixel_grid
+from jaxtrapolate.precision import divide, widest
+
+_STRIDE, _STEPS, _REFINEMENTS = 3, 3, 2  # of the inverse search: those of the preset "medium"
+_SOFT = 0.1  # of the gain: from none of the confidence to all of it
+_UNLIKE = 1e-4  # what a pixel counts at least that is unlike, where no other is left
+
+
+def _around(values, weights: Weights, count: int):
+    """Sums over what is around each pixel, passed on from neighbour to neighbour as far as they are alike."""
+    height, width = values.shape
+    right = weights.right * (jnp.arange(width) < width - 1).astype(weights.right.dtype)[None, :]
+    below = weights.below * (jnp.arange(height) < height - 1).astype(weights.below.dtype)[:, None]
+    left, above = shifted(right, 1, 1), shifted(below, 0, 1)
+
+    def spread(values, _):
+        across = right * shifted(values, 1, -1) + left * shifted(values, 1, 1)
+        return (values + across + below * shifted(values, 0, -1) + above * shifted(values, 0, 1)) / 5, None
+
+    return jax.lax.scan(spread, values, None, length=count)[0]
+
+
+def _guided_enlarged(values, guidance: Guidance, guide):
+    """Images `[N, h, w]` at the size of the guide `[G, H, W]`: linear, but from the pixels that are like."""
+    size = guide.shape[1:]
+    lower, further = [], []
+    for old, new in zip(values.shape[1:], size, strict=True):
+        at = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
+        lower.append(np.minimum(at.astype(int), max(old - 2, 0)))
+        further.append(at - lower[-1])
+    both = jnp.concatenate([values, guidance.guide])
+    total, count = jnp.zeros((len(values), *size), values.dtype), jnp.zeros(size, values.dtype)
+    for j in (0, 1):
+        for i in (0, 1):
+            rows, columns = (
+                np.minimum(low + k, old - 1) for low, k, old in zip(lower, (j, i), values.shape[1:], strict=True)
+            )
+            taken = jnp.take(jnp.take(both, rows, 1), columns, 2)
+            share = np.outer(*(f if k else 1 - f for f, k in zip(further, (j, i), strict=True)))
+            weight = like(taken[len(values) :], guide, guidance.sigma) + _UNLIKE
+            weight = weight * jnp.asarray(share, values.dtype)
+            total, count = total + weight[None] * taken[: len(values)], count + weight
+    return total / count[None]
+
+
+def _confidence(newer, older, flow, guidance: Guidance, options):
+    """How much of what changed between two images, 0..1, the flow explains: 0..1."""
+    least_gain, least_change, reach = options
+    height, width = newer.shape
+    columns, rows = pixel_grid(height, width, newer.dtype)
+    x, y = columns + jnp.real(flow), rows + jnp.imag(flow)
+    seen = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
+    valid = jnp.where(seen, guidance.valid * fetch(guidance.valid, x, y), 0)
+    weights = guidance.of_neighbours()
+    still, moved = jnp.square(newer - older), jnp.square(newer - fetch(older, x, y))
+    count, still, moved = (_around(apart(a * valid), weights, reach) for a in (jnp.ones_like(newer), still, moved))
+    still, moved = divide(still, count), divide(moved, count)
+    gain = 1 - divide(moved, still, otherwise=1)
+    explained = jnp.clip((gain - least_gain) / _SOFT, 0, 1)
+    changed = jnp.clip(divide(still, least_change, where=least_change > 0, otherwise=2) - 1, 0, 1)
+    return explained * changed
+
+
+def _round_trip(flow, back, allowed):
+    """1 where the flow back leads to where the flow came from, 0 where it is off by twice what is allowed."""
+    height, width = flow.shape
+    columns, rows = pixel_grid(height, width, jnp.real(flow).dtype)
+    x, y = columns + jnp.real(flow), rows + jnp.imag(flow)
+    off = jnp.square(jnp.real(flow) + fetch(jnp.real(back), x, y))
+    off = off + jnp.square(jnp.imag(flow) + fetch(jnp.imag(back), x, y))
+    return jnp.clip(2 - jnp.sqrt(off + jnp.finfo(off.dtype).tiny) / allowed, 0, 1)
+
+
+@partial(jax.jit, static_argnames=("finest", "reach"))
+def _shading_flow(
+    newer, older, guide, valid, sigma_guide, least_gain, least_change, round_trip, *, finest, reach
+) -> tuple[Array, Array]:
+    wide, size = widest(newer, older), (newer.shape[0], newer.shape[1])
+    finite = jnp.all(jnp.isfinite(newer), -1) & jnp.all(jnp.isfinite(older), -1)
+    valid = finite if valid is None else finite & valid
+    if guide is not None:
+        known = jnp.isfinite(guide)
+        valid &= jnp.all(known, -1)
+        guide = jnp.where(known, guide, 0).astype(wide)
+    guides = jnp.zeros((1, *size), wide) if guide is None else jnp.moveaxis(guide, -1, 0)
+    sigma, least_gain, least_change = (jnp.asarray(a, wide) for a in (sigma_guide, least_gain, least_change))
+    guidance = Guidance(guides, sigma, valid.astype(wide))
+
+    def gray(image):
+        mean = jnp.mean(jnp.where(valid[..., None], image, 0).astype(wide), -1, keepdims=True)
+        return fill_pyramid(mean, valid)[..., 0]
+
+    first, second = gray(newer), gray(older)
+    effort = Effort(finest, _STRIDE, _STEPS, _REFINEMENTS)
+    flow = inverse_search_flow(first * 255, second * 255, effort, guidance)
+    small = flow.shape[0], flow.shape[1]
+    level = guidance if small == size else guidance.resized(small)
+    for shape in level_sizes(size)[1:]:
+        if first.shape != small:
+            first, second = (resize(a, shape, kind="area") for a in (first, second))
+    confidence = _confidence(first, second, flow, level, (least_gain, least_change, reach))
+    if round_trip is not None:
+        back = inverse_search_flow(gray(older) * 255, gray(newer) * 255, effort, guidance)
+        confidence = confidence * _round_trip(flow, back, jnp.asarray(round_trip, wide))
+    if small == size:
+        parts = jnp.stack([jnp.real(flow), jnp.imag(flow), confidence])
+    else:
+        scale = [new / old for new, old in zip(size, small, strict=True)]
+        parts = jnp.stack([jnp.real(flow) * scale[1], jnp.imag(flow) * scale[0], confidence])
+        parts = _guided_enlarged(parts, level, guides)
+    confidence = jnp.where(valid, parts[2], 0)
+    flow = jnp.where((confidence > 0)[..., None], jnp.stack([parts[0], parts[1]], -1), 0)
+    return flow.astype(newer.dtype), confidence[..., None].astype(newer.dtype)
+
+
+def shading_flow(
+    newer: Float[ArrayLike, "h w c"],
+    older: Float[ArrayLike, "h w c"],
+    *,
+    guide: Float[ArrayLike, "h w g"] | None = None,
+    valid: Bool[ArrayLike, "h w"] | None = None,
+    sigma_guide: float | Float[ArrayLike, ""] = 0.2,
+    finest: int = 1,
+    reach: int = 4,
+    least_gain: float | Float[ArrayLike, ""] = 0.3,
+    least_change: float | Float[ArrayLike, ""] = 3e-5,
+    round_trip: float | Float[ArrayLike, ""] | None = None,
+) -> tuple[Float[Array, "h w 2"], Float[Array, "h w 1"]]:
+    """The motion of light over surfaces that lie still in both images: p of the newer is at p + flow[p] of the older.
+
+    Both images show the same surfaces at the same pixels: frames of two times, warped to one raster and demodulated. So
+    light of the newer image goes on by the same way: after a fraction s of the time between the two, what is at p was
+    at p + s flow[p] of the newer (`backward_warp` with s flow).
+
+    The flow is that of `dis_flow`, in windows that stop at silhouettes: what counts in a patch is like its middle by
+    the guide, what the refinement smooths is like its neighbour. Where the flow does not explain what changed it is 0.
+
+    Args:
+        newer: `[H, W, C]`, demodulated and as displayed: after a tone curve, about 0..1. Channels are averaged.
+        older: likewise.
+        guide: `[H, W, G]`, what tells surfaces apart that light does not go on across: normals, depths in units of
+            their jumps, ids; no albedo, as the texture of a floor is no border of its light. `None`: there is none.
+        valid: bool `[H, W]`, False in holes of either image, which have no weight. `None`: all are.
+        sigma_guide: guides that differ by this count exp(-1/2) for each other.
+        finest: the working resolution: the flow is found at 1 / 2^finest of the size (0: at the size itself), and
+            enlarged from pixels with like guides.
+        reach: how many pixels of the working resolution what changed is averaged over.
+        least_gain: share of the squared change, 0..1, that the flow must explain; all of the confidence is there
+            from 0.1 more on.
+        least_change: squared difference of the images under which nothing has changed; all of the confidence is there
+            from twice that on. Also what has no texture does not change.
+        round_trip: pixels of the working resolution by which the flow back may miss; from twice that on there is no
+            confidence. `None`: the flow back is not made. Shadows that appear or vanish at a border have none.
+
+    Returns:
+        The flow `[H, W, 2]` in pixels, and how far to trust it `[H, W, 1]`, 0..1: a weight for what is made by it
+        against what is made without. Both of the dtype of `newer`; computed in at least float32.
+
+    Convention:
+        Pull: pixels to add, x right, y down.
+
+    Exactness:
+        Equal images have no flow and no confidence, exactly.
+
+    Edge cases:
+        Pixels that are not finite, in an image or in the guide, are holes. In holes both results are 0. Light that
+        appears, vanishes or blinks without moving is explained by no flow.
+
+    Gradient:
+        With respect to both images, the guide and the numbers; which steps the search takes, and where the flow
+        is 0, is held fixed.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, shapes that do not fit, or an option that does not.
+
+    References:
+        Ours; the flow is Kroeger et al. 2016 (see `dis_flow`).
+    """
+    size = check_image("newer", newer)
+    check_image("older", older, size=size, channels=newer.shape[-1])
+    if guide is not None:
+        check_image("guide", guide, size=size)
+    if valid is not None:
+        check_mask("valid", valid, size=size)
+    for name, value, least in (("finest", finest, 0), ("reach", reach, 0)):
+        if value < least:
+            raise ValueError(f"{name}: expected {least} or more, got {value!r}")
+    numbers = sigma_guide, least_gain, least_change, round_trip
+    return _shading_flow(newer, older, guide, valid, *numbers, finest=finest, reach=reach)
