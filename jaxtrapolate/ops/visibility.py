@@ -57,7 +57,8 @@ def expected_depth(
     frame's depths changed as a whole.
 
     Args:
-        depth: `[H, W, 1]` of the target; source_depth: of the source. +inf where nothing is.
+        depth: `[H, W, 1]` of the target; +inf where nothing is.
+        source_depth: `[H, W, 1]` of the source, likewise.
         motion: `[H, W, 2]` from target to source.
 
     Returns:

@@ -87,7 +87,8 @@ def brighten(tree: T, power: float | Float[Array, ""], *, above: float = 4.0, mo
     Args:
         tree: a `Frame`, a `Window`, or any pytree that holds such; leading axes of colours are free.
         power: 0 changes nothing.
-        above, most: radiances, 0 < above < most.
+        above: the radiance from which on it shines, over 0.
+        most: the largest radiance that comes of it, over `above`.
     """
 
     def one(value: Any) -> Any:
