@@ -347,6 +347,20 @@ def extreme_errors() -> str:
     return table(["1000 times the difference", *next(iter(measured.values()))], rows)
 
 
+def masks() -> str:
+    """Precision and recall of the hole masks, before and after holes were found by planes and by depth alone."""
+    before, after = (read(f"experiments/results/hole_masks{k}.json") for k in ("_before", ""))
+
+    def cell(row: dict[str, Sequence[float]], name: str) -> str:
+        return " / ".join(f"{v:.3f}" for v in row[name])
+
+    rows = []
+    for name in after["mean"]:
+        for title, results in ((name, after), ("*before*", before)):
+            rows.append([title, *(cell(row, name) for row in (*results["scenes"].values(), results["mean"]))])
+    return table(["precision / recall", *after["scenes"], "mean"], rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "extreme-functions": partial(_extreme, "functions"),
     "extreme-methods": partial(_extreme, "methods"),
@@ -365,6 +379,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "curve": curve,
     "sizes": sizes,
     "stage-times": stage_times,
+    "masks": masks,
 }
 
 

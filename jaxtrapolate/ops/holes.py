@@ -100,8 +100,7 @@ def _distances(pair: Pair, motion: Array, order: bool) -> tuple[Array, Array, Ar
         return near, divide(1, there, where=~(there == jnp.inf)), None
     then = expected_depth(here, there, motion)
     plane = planes(there)
-    height, width = near.shape[:2]
-    x, y = pixel_grid(height, width, near.dtype)
+    x, y = pixel_grid(near.shape[0], near.shape[1], near.dtype)
     origin = plane[..., :1] - plane[..., 1:2] * x[..., None] - plane[..., 2:] * y[..., None]
     return near, jnp.concatenate([plane, origin], -1), divide(1, then, where=~(then == jnp.inf))
 

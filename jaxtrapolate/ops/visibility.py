@@ -106,7 +106,8 @@ def expected_depth(
 def _votes(image: Array, x: Array, y: Array, expected: Array, least: float) -> tuple[Array, Array]:
     """How much of the 16 pixels around positions is in front of a surface of an expected nearness; and of how much.
 
-    A pixel has the inverse of its distance as its weight (Shepard 1968), so that one that is hit decides alone.
+    A pixel at distance r weighs exp(-r^2 / 2) / r: the inverse of its distance (Shepard 1968), so that one that is hit
+    decides alone, and less of those that are farther off than silhouettes are straight.
     """
     height, width, _ = image.shape
     rows, column, row = image.reshape(-1, 3), jnp.floor(x), jnp.floor(y)
@@ -119,7 +120,8 @@ def _votes(image: Array, x: Array, y: Array, expected: Array, least: float) -> t
         dx, dy = x - column - i, y - row - j
         there = jnp.clip(near + along * dx + down * dy, 0.5 * near, 1.5 * near)
         front = (there > least * expected) | ((near == 0) & (expected > 0))
-        weight = jnp.where(inside, jax.lax.rsqrt(dx * dx + dy * dy + 1e-6), 0)
+        squared = dx * dx + dy * dy
+        weight = jnp.where(inside, jnp.exp(-0.5 * squared) * jax.lax.rsqrt(squared + 1e-6), 0)
         return sums[0] + jnp.where(front, weight, 0), sums[1] + weight
 
     return jax.lax.fori_loop(0, 16, add, (jnp.zeros_like(x), jnp.zeros_like(x)))
@@ -131,10 +133,10 @@ def disoccluded(target: Keyframe, source: Keyframe) -> Bool[Array, "h w"]:
 
     The surface had the depth z' = depth + the backward flow's change in the source frame, at the position x that the
     flow leads to. The 16 source pixels around x vote: by their own planes they are more than 5 % nearer at x, or not,
-    weighted with the inverse of their distance. Where what hides it is seen in the target too, so do the 16 target
+    the nearer ones with more weight. Where what hides it is seen in the target too, so do the 16 target
     pixels around the place that x has beside it there (x less the occluder's own flow): the same silhouette, sampled a
-    fraction of a pixel further. More than half hides. On the embedded scenes that has the precision and recall
-    that are listed in the results' page; what is left are silhouettes that pass between pixels.
+    fraction of a pixel further. More than half hides. `experiments/hole_masks.py` measures its precision and recall on
+    embedded scenes; what is left are silhouettes that pass between pixels.
 
     False beyond the frame. A pixel that shows nothing (depth that is not positive, or infinite) is behind all surfaces;
     where the source shows nothing and the target a surface that was not there, as if hidden.
