@@ -16,7 +16,11 @@ from statistics import fmean
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
-PAGES = ("docs/results.md", "docs/speed.md", "docs/scenes.md", "docs/extreme.md", "experiments/README.md")
+PAGES = (
+    "README.md",
+    *(f"docs/{name}.md" for name in ("results", "speed", "scenes", "extreme")),
+    "experiments/README.md",
+)
 BLOCK = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -33,6 +37,33 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
         raise ValueError(f"table: expected {len(head)} columns in every row, got {[len(row) for row in rows]}")
     first, *others = ("|" + "|".join(f" {cell} " if cell else " " for cell in row) + "|\n" for row in (head, *rows))
     return "".join([first, "|" + "---|" * len(head) + "\n", *others])
+
+
+def evaluated(name: str) -> str:
+    """What `evaluate` says of an input: its `results.json` is kept by the input's name."""
+    found = read(f"experiments/results/evaluated/{name}.json")["methods"]
+    causes = {c: entry["share"] for m in found.values() for c, entry in m["by_cause"].items()}
+    columns: dict[str, Callable[[dict[str, Any]], float]] = {
+        "dB": lambda method: method["psnr"],
+        "SSIM": lambda method: method["ssim"],
+        "ms": lambda method: -method["ms"]["median"],
+    } | {
+        f"{cause} {100 * share:.1f} %": lambda method, cause=cause: method["by_cause"][cause]["psnr"]
+        for cause, share in causes.items()
+    }
+
+    def cell(column: str, value: float) -> str:
+        if column == "ms":
+            return _ms(-value) if value < -1 else f"{-value:.2f}"
+        return f"{value:.3f}" if column == "SSIM" else f"{value:.2f}"
+
+    best = {c: max(get(method) for method in found.values()) for c, get in columns.items() if c != "ms"}
+    rows = []
+    for method, entry in found.items():
+        values = {column: get(entry) for column, get in columns.items()}
+        cells = [f"**{cell(c, v)}**" if best.get(c) == v else cell(c, v) for c, v in values.items()]
+        rows.append([method, *cells])
+    return table(["method", *columns], rows)
 
 
 def search() -> str:
@@ -362,6 +393,11 @@ def masks() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
+    "map": partial(evaluated, "czest1dm"),
+    "clip": partial(evaluated, "bunker"),
+    "cars": partial(evaluated, "torcs"),
+    "map-stripped": partial(evaluated, "czest1dm_stripped"),
+    "cars-stripped": partial(evaluated, "torcs_stripped"),
     "extreme-functions": partial(_extreme, "functions"),
     "extreme-methods": partial(_extreme, "methods"),
     "extreme-listed": extreme_listed,

@@ -6,12 +6,8 @@ _LONGEST = 2000
 class InputError(Exception):
     """Input that cannot be used; the message is one line that names the file and the remedy.
 
-    It can be printed whatever a file's name or content is (`printable`).
-
-    Args:
-        args: the message first.
-        argument: the argument that the message is about; "{argument}" in the message stands for its name, which is
-            `frames` in Python and `--frames` on the command line.
+    It can be printed whatever a file's name or content is (`printable`). With `argument`, the name of what the message
+    is about, "{argument}" in the message stands for that: `frames` in Python, `--frames` on the command line.
     """
 
     def __init__(self, *args: object, argument: str | None = None) -> None:

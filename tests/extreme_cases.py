@@ -254,7 +254,7 @@ def cropped(arguments: tuple, size: tuple[int, int]) -> tuple:
 
 def method_cases(size: tuple[int, int] = (40, 48)) -> dict[str, Case]:
     """Every method but those on the host, on frames with every buffer; networks are small ones with random weights."""
-    return {name: method_case(name, size) for name in test_settings.TRACED}
+    return {name: method_case(name, size) for name in jx.method_names()}
 
 
 def method_case(name: str, size: tuple[int, int]) -> Case:

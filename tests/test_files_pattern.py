@@ -42,6 +42,7 @@ def courtyard(folder, numbers=(1, 2)):
         png(folder / "albedo" / f"{number}.png", codes)
         png(folder / "mask" / f"{number:04d}.png", codes[..., 0] % 3)
         png(folder / "light" / f"{number:04d}.png", codes[..., 1])
+    (folder / "jitter.csv").write_text("1, 0.25, -0.125\n2, -0.5, 0.375\n")
     return multi, codes
 
 
@@ -70,6 +71,7 @@ def test_the_documented_example(tmp_path):
     np.testing.assert_array_equal(gbuffer.albedo, decode_srgb(codes))
     np.testing.assert_array_equal(gbuffer.stencil[..., 0], codes[..., 0] % 3)
     assert sequence.static_ids == (7, "9e3779b1")
+    np.testing.assert_array_equal(frame.jitter, np.float32([-0.5, 0.375]))
     np.testing.assert_allclose(gbuffer.shadow[..., 0], 1 - codes[..., 1] / 255, atol=1e-6)
     assert open_sequence(tmp_path / "jaxtrapolate.toml").numbers == (1, 2)
     assert str(open_sequence(tmp_path, motion="ndc").convention) == "current_minus_previous,ndc,up"

@@ -59,6 +59,7 @@ def test_a_shadow_goes_on():
     assert np.abs(along + np.sum(STEP * outward, -1)[trusted]).mean() < 0.5
 
 
+@pytest.mark.slow
 def test_equal_images_have_no_flow():
     newer, _ = pair()
     for given in ({}, {"guide": newer}, {"round_trip": 1.0}):
@@ -159,6 +160,7 @@ def test_every_size(size):
     assert (np.asarray(confidence) <= 1).all()
 
 
+@pytest.mark.slow
 def test_half_precision_is_computed_in_float32():
     newer, older = (jnp.asarray(image[:40, :60]).astype(jnp.bfloat16) for image in pair())
     results = jx.shading_flow(newer, older)
@@ -195,6 +197,7 @@ def test_gradients_are_those_of_differences(x64):
     np.testing.assert_allclose(found, difference, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_another_number_compiles_nothing():
     import jax._src.test_util as jtu
 
