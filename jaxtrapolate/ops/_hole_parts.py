@@ -1,5 +1,6 @@
 """What the tests behind the hole masks share, whichever taps they look at."""
 
+from functools import reduce
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -36,10 +37,24 @@ def pair_of(target: GBuffer, source: GBuffer, motion: Array) -> Pair:
     return Pair(target, source, x, y, ~(finite & inside(x, y, *motion.shape[:2]))[..., None])
 
 
+def channels(image: Array) -> list[Array]:
+    """Each channel `[H, W, 1]`: sums over three of them are written out, because XLA's loops over three are slow."""
+    return [image[..., k : k + 1] for k in range(image.shape[-1])]
+
+
+def _product(a: list[Array], b: list[Array]) -> Array:
+    return reduce(jnp.add, (x * y for x, y in zip(a, b, strict=True)))
+
+
 def dot(a: Array, b: Array) -> Array:
-    """The inner product over channels, `[H, W, 1]`; written out, because XLA's loops over three numbers are slow."""
-    terms = (a[..., k : k + 1] * b[..., k : k + 1] for k in range(a.shape[-1]))
-    return cast(Array, sum(terms))  # there is a channel, so that it is not the int 0
+    """The inner product over channels, `[H, W, 1]`."""
+    return _product(channels(a), channels(b))
+
+
+def _scaled(vector: list[Array]) -> list[Array]:
+    """Divided by the largest component, held fixed, so that no square over- or underflows."""
+    size = divide(1, jax.lax.stop_gradient(reduce(jnp.maximum, map(jnp.abs, vector))))
+    return [component * size for component in vector]
 
 
 def softened(excess: Array, softness: Any) -> Array:
@@ -52,13 +67,12 @@ def cosine(target: Array, warped: Array, *, unit: bool) -> tuple[Array, Array]:
 
     Not scaled, components beyond 1e15 are held there.
     """
-    if unit:  # by the largest component first, so that no square over- or underflows
-        largest = (jax.lax.stop_gradient(jnp.max(jnp.abs(n), -1, keepdims=True)) for n in (target, warped))
-        target, warped = (divide(n, size) for n, size in zip((target, warped), largest, strict=True))
+    if unit:
+        first, second = _scaled(channels(target)), _scaled(channels(warped))
     else:
-        target, warped = (jnp.clip(n, -_LONGEST, _LONGEST) for n in (target, warped))
-    here, there = dot(target, target), dot(warped, warped)
-    product = dot(target, warped)
+        first, second = ([jnp.clip(c, -_LONGEST, _LONGEST) for c in channels(n)] for n in (target, warped))
+    here, there = _product(first, first), _product(second, second)
+    product = _product(first, second)
     return divide(product, root(here * there)) if unit else product, (here > 0) | (there > 0)
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Collection
 from functools import partial, reduce
-from typing import Literal, NamedTuple, cast, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import jax
 import jax.numpy as jnp
@@ -87,22 +87,25 @@ def _shows_nothing(target: GBuffer, source: GBuffer) -> list[Array] | None:
     return [reduce(jnp.logical_or, side) for side in zip(*masks, strict=True)] if masks else None
 
 
-def _distances(pair: Pair, motion: Array, order: bool) -> tuple[Array, Array, Array | None]:
-    """What the taps' depths are compared by: images `[H, W, C]` of the target and of the source.
+def _nearness(buffers: GBuffer, bare: Array, known: bool, dtype: Any) -> Array:
+    """1 / depth, 0 where nothing is shown; without depth in both frames 1 at all surfaces. No gradient."""
+    if not known:
+        return jnp.where(bare, 0, 1).astype(dtype)
+    depth = jax.lax.stop_gradient(jnp.asarray(buffers.depth, dtype))
+    return divide(1, depth, where=~bare)
 
-    Their nearness; with `order`, of the target also the nearness that it had in the source if it moved as the frame
-    does, of the source also the plane of each pixel, as its nearness at pixel (0, 0) and its slopes.
+
+def _order(pair: Pair, motion: Array) -> tuple[Array, Array]:
+    """The nearness that the target had in the source if it moved as the frame does, and the planes of the source.
+
+    A plane is the nearness at pixel (0, 0) and its slopes, `[H, W, 3]`.
     """
     here, there = (surface_depth(cast(Array, g.depth), g.sky) for g in (pair.target, pair.source))
     here, there = (jax.lax.stop_gradient(d.astype(pair.x.dtype)) for d in (here, there))
-    near = divide(1, here, where=~(here == jnp.inf))
-    if not order:
-        return near, divide(1, there, where=~(there == jnp.inf)), None
-    then = expected_depth(here, there, motion)
-    plane = planes(there)
-    x, y = pixel_grid(near.shape[0], near.shape[1], near.dtype)
+    then, plane = expected_depth(here, there, motion), planes(there)
+    x, y = pixel_grid(here.shape[0], here.shape[1], plane.dtype)
     origin = plane[..., :1] - plane[..., 1:2] * x[..., None] - plane[..., 2:] * y[..., None]
-    return near, jnp.concatenate([plane, origin], -1), divide(1, then, where=~(then == jnp.inf))
+    return divide(1, then, where=~(then == jnp.inf)), jnp.concatenate([origin, plane[..., 1:]], -1)
 
 
 def _depth_mask(
@@ -112,31 +115,31 @@ def _depth_mask(
 
     Nearer counts where positions say nothing.
     """
-    dtype, known = motion.dtype, pair.both("depth")
-    images, near, then = [sides[1].astype(pair.x.dtype)], None, None
-    if known:
-        near, source, then = _distances(pair, motion, order=not pair.both("position"))
-        images.append(source)
+    dtype, known, then = motion.dtype, pair.both("depth"), None
+    near, image = (
+        _nearness(g, nothing_there, known, pair.x.dtype)
+        for g, nothing_there in zip((pair.target, pair.source), sides, strict=True)
+    )
+    if known and not pair.both("position"):
+        then, plane = _order(pair, motion)
+        image = jnp.concatenate([image, plane], -1)
     x, y = (jax.lax.stop_gradient(v)[..., None] for v in (pair.x, pair.y))
     x, y = jnp.clip(x, 0, motion.shape[1] - 1), jnp.clip(y, 0, motion.shape[0] - 1)
-    other, differs, empty = jnp.zeros(pair.outside.shape, dtype), jnp.zeros(pair.outside.shape, bool), sides[0]
-    unlike = []
-    for tap, weight in _taps_around(jnp.concatenate(images, -1), pair, taps):
-        there = tap[..., :1] > 0.5
-        apart = there != sides[0]
+    bare = empty = near == 0
+    other, differs, unlike = jnp.zeros(pair.outside.shape, dtype), jnp.zeros(pair.outside.shape, bool), []
+    for tap, weight in _taps_around(image, pair, taps):
+        nearness = tap[..., :1]
+        there = nearness == 0
         empty = empty & (there | (weight <= 0))
-        if near is not None:
-            surfaces = ~there & ~sides[0]
-            least, most = jnp.minimum(near, tap[..., 1:2]), jnp.maximum(near, tap[..., 1:2])
-            apart |= surfaces & (_REMOTE * least < most)
+        apart = (there != bare) | (_REMOTE * jnp.minimum(near, nearness) < jnp.maximum(near, nearness))
         unlike.append(apart)
         if then is not None:
-            found = tap[..., 4:5] + tap[..., 2:3] * x + tap[..., 3:4] * y
-            apart |= surfaces & (found > (1 + jnp.asarray(threshold, found.dtype)) * then)
+            found = tap[..., 1:2] + tap[..., 2:3] * x + tap[..., 3:] * y
+            apart |= ~there & ~bare & (found > (1 + jnp.asarray(threshold, found.dtype)) * then)
         other = other + jnp.where(apart, weight.astype(dtype), 0)
         differs |= apart & (weight > 0)
     mask = jnp.where(pair.outside, 0, other) if soft else differs & ~pair.outside
-    return mask, _Bare(sides[0], unlike, empty)
+    return mask, _Bare(bare, unlike, empty)
 
 
 def _stencil_mask(pair: Pair, taps: Taps, soft: bool) -> tuple[Array, Array]:

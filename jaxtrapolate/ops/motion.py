@@ -49,8 +49,9 @@ def chain_motion(newer: Float[Array, "h w 2"], older: Float[Array, "h w 2"]) -> 
     """
     size = check_image("newer", newer, channels=2)
     check_image("older", older, size=size, channels=2)
-    newer = held_motion(newer)
-    return newer + held_motion(backward_warp(older, newer).astype(newer.dtype))
+    led = backward_warp(older, newer).astype(newer.dtype)
+    # by component, because XLA's loops over two numbers are slow
+    return jnp.stack([held_motion(newer[..., k]) + held_motion(led[..., k]) for k in (0, 1)], -1)
 
 
 @partial(jax.jit, static_argnames=("sign", "units", "y_axis"))

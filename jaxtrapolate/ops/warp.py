@@ -43,10 +43,11 @@ def landing(motion: Float[Array, "h w 2"]) -> tuple[Float[Array, "h w"], Float[A
     The motion is `held_motion`. The gradient is zero where it is not finite.
     """
     height, width, _ = motion.shape
-    motion = held_motion(motion.astype(widest(motion)))
-    finite = jnp.isfinite(motion[..., 0]) & jnp.isfinite(motion[..., 1])
-    x, y = pixel_grid(height, width, motion.dtype)
-    return x + jnp.where(finite, motion[..., 0], 0), y + jnp.where(finite, motion[..., 1], 0), finite
+    right, down = (motion[..., k].astype(widest(motion)) for k in (0, 1))  # XLA's loops over two numbers are slow
+    finite = jnp.isfinite(right) & jnp.isfinite(down)
+    x, y = pixel_grid(height, width, right.dtype)
+    right, down = (jnp.where(finite, held_motion(v), 0) for v in (right, down))
+    return x + right, y + down, finite
 
 
 def inside(x: Float[Array, "*n"], y: Float[Array, "*n"], height: int, width: int) -> Bool[Array, "*n"]:
