@@ -24,6 +24,12 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     atexit.register(shutil.rmtree, _compiled, ignore_errors=True)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": _compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3"}
 
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    # What the user has measured here is none of the tests' business: they have a cache folder of their own.
+    _cache = tempfile.mkdtemp(prefix="jaxtrapolate-tests-cache-")
+    atexit.register(shutil.rmtree, _cache, ignore_errors=True)
+    os.environ["XDG_CACHE_HOME"] = _cache
+
 
 def pytest_configure(config):
     """The fast tests alone let LLVM leave out what makes programs faster: most of their time is compilation.

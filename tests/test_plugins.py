@@ -56,7 +56,8 @@ def dump(tmp_path_factory):
     return folder
 
 
-def test_a_method_of_another_package(package, capsys, dump, tmp_path):
+def test_a_method_of_another_package(package, capsys, dump, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     assert jx.method_names()[-3:] == ("brighter", "broken", "nothing")
     assert method_description("brighter") == "The newest rendered frame, twice as bright."
     assert [s.name for s in jx.load("warp").stages] != ["brighten"]  # no package replaces one of this library

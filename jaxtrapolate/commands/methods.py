@@ -3,6 +3,7 @@
 import argparse
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from jaxtrapolate.commands.inputs import parse_size, progress, terminal
@@ -42,14 +43,18 @@ def run(options: argparse.Namespace) -> None:
         _measure([options.name] if options.name else list(method_names()), parse_size(options.size or "1280x720"))
     times = kept_times()
     if options.name is None:
-        table = Table()
-        for column in ("method", "kind", "frames", *(["ms"] if times else []), "what it does"):
-            table.add_column(column, no_wrap=column != "what it does", justify="right" if column == "ms" else "left")
-        for name in method_names():
-            method, text = _loaded(name)
-            facts = ("", "") if method is None else (method.kind, _frames(method))
-            table.add_row(name, *facts, *([_ms(times, name)] if times else []), text)
-        out.print(table)
+        loaded = {name: _loaded(name) for name in method_names()}
+        kinds = {name: "not to be had here" if method is None else method.kind for name, (method, _) in loaded.items()}
+        for kind in dict.fromkeys(kinds.values()):
+            table = Table(title=kind, title_justify="left", box=SIMPLE_HEAD)
+            for column in ("method", "frames", *(["ms"] if times else [])):
+                table.add_column(column, no_wrap=True, justify="right" if column == "ms" else "left")
+            table.add_column("what it does")
+            for name in (name for name in kinds if kinds[name] == kind):
+                method, text = loaded[name]
+                frames = "" if method is None else _frames(method)
+                table.add_row(name, frames, *([_ms(times, name)] if times else []), text)
+            out.print(table)
         out.print("frames: rendered ones that it takes at most, before + after the one to be generated", soft_wrap=True)
         out.print(f"ms: {times or 'not measured here yet; --measure does'}", soft_wrap=True)
         return

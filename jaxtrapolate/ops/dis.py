@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from jaxtrapolate.checks import ArrayLike, Size, check_choice, check_image
-from jaxtrapolate.ops.farneback import gray_levels
 from jaxtrapolate.ops.patches import PATCH, centres, cut, densify, patches, search, second_image
 from jaxtrapolate.ops.refinement import Weights, refine
-from jaxtrapolate.ops.resample import apart, resize
+from jaxtrapolate.ops.resample import gray_levels, resize
+from jaxtrapolate.ops.strips import once
 
 Preset = Literal["ultrafast", "fast", "medium"]
 
@@ -86,7 +86,7 @@ class Guidance(NamedTuple):
         def beside(axis):
             size = self.guide.shape[axis]
             after = jnp.take(self.guide, jnp.minimum(jnp.arange(1, size + 1), size - 1), axis)
-            return apart(like(self.guide, after, self.sigma))
+            return once(like(self.guide, after, self.sigma))
 
         return Weights(self.valid, beside(2), beside(1))
 
@@ -99,7 +99,7 @@ def inverse_search_flow(
     finest = min(effort.finest, len(sizes) - 1)
     images = [(first, second, guidance)]
     for smaller in sizes[1:]:
-        first, second = (apart(resize(a, smaller, kind="area")) for a in (first, second))
+        first, second = (once(resize(a, smaller, kind="area")) for a in (first, second))
         guidance = None if guidance is None else guidance.resized(smaller)
         images.append((first, second, guidance))
     zero = jnp.zeros(sizes[-1], first.dtype)

@@ -8,25 +8,22 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import ArrayLike, check_image
-from jaxtrapolate.ops.fill import fill_pyramid
-from jaxtrapolate.ops.resample import Resampling, apart, bordered, fetch, gaussian, resample, resize, window
-from jaxtrapolate.ops.warp import all_finite, pixel_grid
-from jaxtrapolate.precision import widest
+from jaxtrapolate.ops.resample import (
+    Resampling,
+    bordered,
+    fetch,
+    gaussian,
+    gray_levels,
+    resample,
+    resize,
+    window,
+)
+from jaxtrapolate.ops.strips import once
+from jaxtrapolate.ops.warp import pixel_grid
 
-_SCALE = 255.0  # of grey levels: constants of both flows are for images of 8 bits
 _LEAST = 32  # pixels: no level of a pyramid is smaller
 _BORDER = (0.14, 0.14, 0.4472, 0.4472, 0.4472)  # what the outermost pixels' equations are weighted with
 _DAMPING = 1e-3  # of the determinant
-
-
-def gray_levels(image: Float[ArrayLike, "h w 1"]) -> Float[Array, "h w"]:
-    """0..255 where the image is 0..1, at least float32; what is not finite is filled from around it."""
-    image = jnp.asarray(image).astype(widest(image))
-
-    def fill(image):
-        return fill_pyramid(jnp.where(jnp.isfinite(image), image, 0), jnp.all(jnp.isfinite(image), -1))
-
-    return jax.lax.cond(all_finite(image), lambda i: i, fill, image)[..., 0] * _SCALE
 
 
 def _expansion(image, radius: int, sigma: float):
@@ -43,11 +40,11 @@ def _expansion(image, radius: int, sigma: float):
     smooth, slope, bend = (bordered(window(padded, g * at**k, 0), radius, 1) for k in (0, 1, 2))
     mean = window(smooth, g, 1)
     return (
-        apart(window(slope, g, 1) * inverse[2][2]),
-        apart(window(smooth, g * at, 1) * inverse[1][1]),
-        apart(mean * inverse[4][0] + window(bend, g, 1) * inverse[4][4]),
-        apart(mean * inverse[3][0] + window(smooth, g * at**2, 1) * inverse[3][3]),
-        apart(window(slope, g * at, 1) * inverse[5][5]),
+        once(window(slope, g, 1) * inverse[2][2]),
+        once(window(smooth, g * at, 1) * inverse[1][1]),
+        once(mean * inverse[4][0] + window(bend, g, 1) * inverse[4][4]),
+        once(mean * inverse[3][0] + window(smooth, g * at**2, 1) * inverse[3][3]),
+        once(window(slope, g * at, 1) * inverse[5][5]),
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from jaxtrapolate.checks import Size
-from jaxtrapolate.ops.resample import apart
+from jaxtrapolate.ops.strips import once
 from jaxtrapolate.ops.warp import take_rows
 from jaxtrapolate.precision import divide
 
@@ -243,7 +243,7 @@ def densify(
     more = (PATCH - 1) // stride
     margin = ((more, more), (more, more))
     weights = jnp.pad(weights.reshape(PATCH, PATCH, rows, columns), ((0, 0), (0, 0), *margin))
-    x, y = (apart(jnp.pad(a.reshape(rows, columns), margin)) for a in (x, y))
+    x, y = (once(jnp.pad(a.reshape(rows, columns), margin)) for a in (x, y))
     tall, wide = rows + more, columns + more
 
     def phase(j, i):

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from jaxtrapolate.ops.patches import gradient
-from jaxtrapolate.ops.resample import apart, fetch
+from jaxtrapolate.ops.resample import fetch
+from jaxtrapolate.ops.strips import once
 from jaxtrapolate.ops.warp import pixel_grid
 
 _ALPHA, _DELTA, _GAMMA = 20.0, 5.0, 10.0  # smoothness, constancy of grey levels, of their gradient
@@ -44,11 +45,11 @@ def _terms(first, second, flow) -> _Terms:
     height, width = first.shape
     columns, rows = pixel_grid(height, width, first.dtype)
     warped = fetch(second, columns + jnp.real(flow), rows + jnp.imag(flow))
-    mean, change = apart((first + warped) * 0.5), warped - first
-    x, y = (apart(gradient(mean, axis)) for axis in (1, 0))
-    tx, ty = (apart(gradient(change, axis)) for axis in (1, 0))
-    xx, xy, yy = apart(gradient(x, 1)), apart(gradient(x, 0)), apart(gradient(y, 0))
-    return _Terms(apart(change), x, y, tx, ty, xx, xy, yy)
+    mean, change = once((first + warped) * 0.5), warped - first
+    x, y = (once(gradient(mean, axis)) for axis in (1, 0))
+    tx, ty = (once(gradient(change, axis)) for axis in (1, 0))
+    xx, xy, yy = once(gradient(x, 1)), once(gradient(x, 0)), once(gradient(y, 0))
+    return _Terms(once(change), x, y, tx, ty, xx, xy, yy)
 
 
 def shifted(a, axis, by):
@@ -75,7 +76,7 @@ def _smoothness(flow, weights):
         jnp.where(edge, jnp.square(jnp.real(d)) + jnp.square(jnp.imag(d)), 0)
         for d, edge in zip(differences, edges, strict=True)
     ]
-    strength = apart(0.5 * _ALPHA * _penalty(squares[0] + squares[1]))
+    strength = once(0.5 * _ALPHA * _penalty(squares[0] + squares[1]))
     right, below = (jnp.where(edge, strength, 0) for edge in edges)
     if weights is not None:
         right, below = right * weights.right, below * weights.below
@@ -93,7 +94,7 @@ def _data(terms: _Terms, step, weights):
     slope = 0.5 * _GAMMA * _penalty(jnp.square(apart_x) / norm_x + jnp.square(apart_y) / norm_y)
     if weights is not None:
         grey, slope = grey * weights.pixels, slope * weights.pixels
-    grey, slope_x, slope_y = apart(grey), apart(slope / norm_x), apart(slope / norm_y)
+    grey, slope_x, slope_y = once(grey), once(slope / norm_x), once(slope / norm_y)
     a = grey * x * x + slope_x * xx * xx + slope_y * xy * xy + _ZETA
     b = grey * x * y + slope_x * xx * xy + slope_y * xy * yy
     c = grey * y * y + slope_x * xy * xy + slope_y * yy * yy + _ZETA
@@ -107,7 +108,7 @@ def _quarters(a):
     """Pixels of even and odd rows and columns, four images; 0 beyond an odd edge."""
     height, width = a.shape
     a = jnp.pad(a, ((0, height % 2), (0, width % 2)))
-    return [[apart(a[j::2, i::2]) for i in (0, 1)] for j in (0, 1)]
+    return [[once(a[j::2, i::2]) for i in (0, 1)] for j in (0, 1)]
 
 
 def _whole(quarters, size):

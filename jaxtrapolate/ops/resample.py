@@ -11,10 +11,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Inexact
+from jaxtyping import Array, Float
 
-from jaxtrapolate.checks import Size
-from jaxtrapolate.ops.warp import sample
+from jaxtrapolate.checks import ArrayLike, Size
+from jaxtrapolate.ops.fill import fill_pyramid
+from jaxtrapolate.ops.strips import once
+from jaxtrapolate.ops.warp import all_finite, sample
+from jaxtrapolate.precision import widest
+
+_SCALE = 255.0  # of grey levels: constants of both flows are for images of 8 bits
 
 
 class Resampling(NamedTuple):
@@ -115,26 +120,29 @@ def resize(image: Float[Array, "h w"], size: Size, *, kind: str = "linear") -> F
     return resample(image, Resampling(height, size[0], kind), Resampling(width, size[1], kind))
 
 
-def apart(image: Inexact[Array, "h w"]) -> Inexact[Array, "h w"]:
-    """The image, computed once: XLA on a CPU computes what several consumers read in each of them, and fuses a window
-    with what it slides over; what a loop reads it computes before."""
+def gray_levels(image: Float[ArrayLike, "h w 1"]) -> Float[Array, "h w"]:
+    """0..255 where the image is 0..1, at least float32; what is not finite is filled from around it."""
+    image = jnp.asarray(image).astype(widest(image))
 
-    def rows(image):
-        return jax.lax.scan(lambda _, row: (None, row), None, image)[1]
+    def fill(image):
+        return fill_pyramid(jnp.where(jnp.isfinite(image), image, 0), jnp.all(jnp.isfinite(image), -1))
 
-    return jax.lax.platform_dependent(image, cpu=rows, default=lambda image: image)
+    scaled = jax.lax.cond(all_finite(image), lambda i: i, fill, image)[..., 0] * _SCALE
+    largest = jnp.finfo(scaled.dtype).max
+    # also so that no product is fused into a difference of two images: equal ones would differ by its rounding
+    return jnp.clip(scaled, -largest, largest)
 
 
 def fetch(image: Float[Array, "h w"], x: Float[Array, "i j"], y: Float[Array, "i j"]) -> Float[Array, "i j"]:
     """The image, all finite, at positions between its pixels, bilinear; computed once."""
-    return apart(sample(image[..., None], x, y, product=jnp.multiply)[..., 0])
+    return once(sample(image[..., None], x, y, product=jnp.multiply)[..., 0])
 
 
 def bordered(image: Float[Array, "h w"], margin: int, axis: int) -> Float[Array, "h w"]:
     """The image with `margin` more pixels at both ends of an axis, which repeat its edge; computed once."""
     padding = [(0, 0), (0, 0)]
     padding[axis] = (margin, margin)
-    return apart(jnp.pad(image, padding, mode="edge"))
+    return once(jnp.pad(image, padding, mode="edge"))
 
 
 def window(padded: Float[Array, "h w"], weights: np.ndarray, axis: int) -> Float[Array, "h w"]:

@@ -15,7 +15,8 @@ from jaxtrapolate.checks import ArrayLike, check_image
 from jaxtrapolate.ops.dis import Effort, Guidance, inverse_search_flow, level_sizes, like
 from jaxtrapolate.ops.fill import check_mask, fill_pyramid
 from jaxtrapolate.ops.refinement import Weights, shifted
-from jaxtrapolate.ops.resample import apart, fetch, resize
+from jaxtrapolate.ops.resample import fetch, resize
+from jaxtrapolate.ops.strips import once
 from jaxtrapolate.ops.warp import pixel_grid
 from jaxtrapolate.precision import divide, widest
 
@@ -71,7 +72,7 @@ def _confidence(newer, older, flow, guidance: Guidance, options):
     valid = jnp.where(seen, guidance.valid * fetch(guidance.valid, x, y), 0)
     weights = guidance.of_neighbours()
     still, moved = jnp.square(newer - older), jnp.square(newer - fetch(older, x, y))
-    count, still, moved = (_around(apart(a * valid), weights, reach) for a in (jnp.ones_like(newer), still, moved))
+    count, still, moved = (_around(once(a * valid), weights, reach) for a in (jnp.ones_like(newer), still, moved))
     still, moved = divide(still, count), divide(moved, count)
     gain = 1 - divide(moved, still, otherwise=1)
     explained = jnp.clip((gain - least_gain) / _SOFT, 0, 1)

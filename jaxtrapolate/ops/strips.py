@@ -51,12 +51,24 @@ def _by_strips_jvp(function, height, primals, tangents):
     return jax.jvp(lambda sources: function(sources, 0, height), primals, tangents)
 
 
+@jax.custom_jvp
 def once(value: Array) -> Array:
-    """The value `[rows, ...]`, which is not differentiated, computed once.
+    """The value `[rows, ...]`, computed once.
 
-    XLA on a CPU computes what several consumers read in each of them; what a loop reads it computes before.
+    XLA on a CPU computes what several consumers read in each of them, and fuses a window with what it slides over; what
+    a loop reads it computes before. (A scan that only hands its rows on is none: JAX takes it out.)
     """
-    value = jax.lax.stop_gradient(value)
-    return jax.lax.platform_dependent(
-        value, cpu=lambda v: jax.lax.scan(lambda _, row: (None, row), None, v)[1], default=lambda v: v
-    )
+
+    def rows(value):
+        def step(number, result):
+            row = jax.lax.dynamic_index_in_dim(value, number, keepdims=True)
+            return jax.lax.dynamic_update_slice_in_dim(result, row, number, 0)
+
+        return jax.lax.fori_loop(0, value.shape[0], step, jnp.zeros_like(value))
+
+    return jax.lax.platform_dependent(value, cpu=rows, default=lambda value: value)
+
+
+@once.defjvp
+def _once_jvp(primals, tangents):
+    return once(*primals), *tangents
