@@ -395,7 +395,7 @@ def test_methods_without_networks_say_so():
 
 def test_stages_before_are_named(methods):
     history, target = make_window()
-    with pytest.raises(ValueError, match="expected one of the stages reproject, occlusion motion, holes"):
+    with pytest.raises(ValueError, match="expected one of the stages reproject, holes, occlusion motion"):
         methods["ours"].values_before("networks", methods["ours"].state, (), history, target)
 
 

@@ -10,7 +10,7 @@ from synthetic import make_frame
 
 import jaxtrapolate as jx
 from jaxtrapolate.evaluation.windows import hide
-from jaxtrapolate.methods import Method, Stage, default_methods
+from jaxtrapolate.methods import Method, Needed, Stage, default_methods
 from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.records import Frame, replace
@@ -270,3 +270,42 @@ def test_any_optional_stage_may_be_left_out(name, left_out):
     assert np.isfinite(image).all()
     if left_out != "linear motion":  # the cameras of these frames do not move
         assert jx.psnr(image, frames[5].color) > 18
+
+
+def test_a_stage_runs_where_it_is_needed():
+    """The count is of the branch that was taken: by a callback of the compiled program."""
+    runs = []
+
+    def costly(state, values):
+        jax.debug.callback(lambda: runs.append(1))
+        return {"image": 2 * values["history"][-1].color}
+
+    needed = Needed(
+        "anything moves",
+        lambda state, values: jnp.any(values["target"].motion != 0),
+        lambda state, values: {"image": values["history"][-1].color},
+    )
+    stages = (Stage("costly", costly, ("history", "target"), ("image",), reads=("history.color",), needed=needed),)
+    method = Method("spared", stages)
+    frame = Frame(color=jnp.ones((4, 6, 3)), time=0.0)
+    for motion, expected in ((0.0, 1.0), (1.0, 2.0)):
+        image = method((frame,), Frame(motion=jnp.full((4, 6, 2), motion), time=1.0))
+        np.testing.assert_array_equal(image, jnp.full((4, 6, 3), expected))
+        jax.effects_barrier()
+        assert len(runs) == motion
+
+
+@pytest.mark.parametrize("name, stage", [("occlusion_warp", "occlusion motion"), ("guided_net", "network")])
+def test_what_is_spared_gives_the_same(name, stage):
+    """Without the test the image is the same: in frames that stand still, and in frames that do not."""
+    method = jx.load(name)
+    spared = dataclasses.replace(
+        method, stages=tuple(dataclasses.replace(s, needed=None) if s.name == stage else s for s in method.stages)
+    )
+    assert [s.needed is None for s in method.stages if s.name == stage] == [False]
+    moving = [jax.tree.map(jnp.float32, make_frame(time, SIZE)) for time in range(3)]
+    still = [replace(moving[0], motion=jnp.zeros((*SIZE, 2)), time=jnp.float32(time)) for time in range(3)]
+    for frames in (moving, still):
+        given = tuple(frames[:2]), hide(frames[2])
+        np.testing.assert_allclose(method(*given), spared(*given), rtol=2e-6, atol=2e-6)
+    np.testing.assert_array_equal(method(*given), still[0].color)

@@ -109,6 +109,8 @@ def _ms(times: MethodTimes, name: str) -> str:
 def _runs(stage: Stage, stages: tuple[Stage, ...]) -> str:
     """When a stage runs."""
     said = [] if stage.on == "generated" else [{"rendered": "on rendered frames", "both": "on every frame"}[stage.on]]
+    if stage.needed:
+        said.append(f"where {stage.needed.where}")
     if stage.fallback:
         said.append(f"where no stage gave {', '.join(stage.gives)}")
     if stage.optional:

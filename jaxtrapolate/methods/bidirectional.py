@@ -204,7 +204,7 @@ def _guided_fetch(state, values: Values):
     for frame, given, motion, seen in both:
         layers = fetch_guided(given, motion, ~seen, values["target"].gbuffer, frame.gbuffer, state.settings)
         color = backward_warp(given[..., -3:], motion)
-        color = jnp.where(seen, color, layers[..., -3:])  # so that what stands still stays as it is
+        color = jnp.where(seen, color, layers[..., -3:])  # so that what stands still is exact
         fetched.append(jnp.concatenate([layers[..., :-3], color], -1))
         inside.append(in_frame(motion)[..., None])
     one = inside[1].astype(values["alpha"].dtype)
@@ -261,7 +261,7 @@ RELIGHT = Stage(
 """Blends light instead of colour: over each frame's reflectance, times the target's.
 
 Where light is not reflectance times irradiance (emission, fog) that prints a texture which is not there. There the two
-frames agree better as they are: blocks of 8 x 8 pixels take the colour as it is by how much better it agrees, and so do
+frames agree better undivided: blocks of 8 x 8 pixels take the undivided colour by how much better it agrees, and so do
 pixels that stand still.
 """
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.checks import check_choice
 from jaxtrapolate.errors import printable
 from jaxtrapolate.methods.hindsight import hindsight_stage
-from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.method import Method, Needed, Stage, Values
 from jaxtrapolate.methods.options import settings
 from jaxtrapolate.methods.stages import (
     COMPOSITE,
@@ -56,7 +56,7 @@ class Preparation:
         first_guess: x's first three channels, which the network corrects: the newest frame by the "warp" along the
             motion, or by the "guided" warp (albedo and normals, else the stencil; without any, the warp).
         by, floor: of `demodulate`; with floor 0 what reflects nothing is 0.
-        sky: whether the sky's colour is fed as it is; else demodulated like the rest, by the albedo stored there.
+        sky: whether the sky's colour is fed undivided; else demodulated like the rest, by the albedo stored there.
         outside: what a warp fetches beyond the frame.
         taps, position_threshold: of `hole_masks`.
         depth: "relative" is m / (m + depth), m the harmonic mean over the frame: 1/2 there, 0 at the sky. "minmax" is
@@ -197,9 +197,13 @@ def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
             "features": features(values["target"].gbuffer, first, preparation) if config.features else None,
             "history": jnp.stack(sources[::-1]) if sources else None,
         }
-        return {"inputs": inputs}
+        motions, still = values["motions"], jnp.zeros_like(values["holes"])
+        if len(motions) > 1:  # with one rendered frame it is not known whether anything changes
+            still = standing([source.color for source in values["sources"]], *motions)
+        return {"inputs": inputs, "still": still}
 
-    return Stage("inputs", function, ("target", "layers", "masks", "histories", "warped", *COMPOSITE), ("inputs",))
+    takes = ("target", "layers", "masks", "sources", "motions", "histories", "warped", *COMPOSITE)
+    return Stage("inputs", function, takes, ("inputs", "still"))
 
 
 def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name: str = NAME) -> Method:
@@ -212,7 +216,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
     apart, else that of the newest frame, warped as the first guess is. Outside holes the network's correction is held
     within what its inputs differ by (`explained`), and where nothing moves and all rendered frames are equal, tile by
     tile, the newest is the result (`standing`). Where the guided warp makes the first guess, hindsight mixes in that of
-    the colour as it is: of the guess 1 - share is left and of the network's correction 1 - share^2. The options are
+    the undivided colour: of the guess 1 - share is left and of the network's correction 1 - share^2. The options are
     then those of the guided warp, and of hindsight; all else that could be set was set when the network was trained.
 
     What a scene lacks is left out: no albedo, no demodulation; no depth, no occlusion motion, the composite is the
@@ -249,18 +253,23 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
             others += list(inputs["history"][..., :3])
         correction = explained(answer - first, (first, *others), free=inputs["mask"] < 0.5)
         image = log_decode(first + correction)
-        guess, own = values["warped"][..., :3], values["warped"][..., 3:]  # the colour as it is, where hindsight asks
+        guess, own = values["warped"][..., :3], values["warped"][..., 3:]  # undivided, where hindsight asks for it
         if share is not None:  # of the guess 1 - share is left, of its correction 1 - share^2
             known = jnp.all(jnp.isfinite(values["warped"]), -1, keepdims=True)
             share, own = jnp.where(known, share, 0), jnp.where(known, own, 0)
             onward = guess + (1 + share) * (image - guess)
             image = jnp.where(known, jnp.where(onward > 0, onward, 0), image)
-        motions = values["motions"]
-        if len(motions) > 1:  # with one rendered frame it is not known whether anything changes
-            still = standing([source.color for source in values["sources"]], *motions)
-            image = jnp.where(still, values["histories"][0].astype(image.dtype), image)
+        image = jnp.where(values["still"], values["histories"][0].astype(image.dtype), image)
+        return outputs(image, guess, own, share)
+
+    def outputs(image, guess, own, share):
         warped = jnp.concatenate([image, own.astype(image.dtype)], -1)
         return {"warped": warped, "image": image, "guess": guess, "plain_share": share}
+
+    def newest(state, values: Values):
+        image = values["histories"][0].astype(widest(values["inputs"]["x"]))
+        guess, own = values["warped"][..., :3], values["warped"][..., 3:]
+        return outputs(image, guess, own, values["plain_share"])
 
     def sky(state, values: Values):
         image = values["image"]
@@ -271,8 +280,8 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
     past = max(1, config.histories)
     stages = (
         reproject_stage(past),
-        dataclasses.replace(OCCLUSION, optional=True),
         holes_stage(preparation.taps, position_threshold=preparation.position_threshold),
+        dataclasses.replace(OCCLUSION, optional=True),
         *((hindsight_stage(preparation),) if guided else ()),
         demodulate_stage(preparation),
         Stage("warp", warp, ("layers", "motions"), ("histories", "warped")),
@@ -281,8 +290,9 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
         Stage(
             "network",
             network,
-            takes=("inputs", "sources", "motions", "histories", "warped", "plain_share?"),
+            takes=("inputs", "still", "histories", "warped", "plain_share?"),
             gives=("warped", "image", "guess", "plain_share"),
+            needed=Needed("not all stands still", lambda state, values: ~jnp.all(values["still"]), newest),
         ),
         modulate_stage(preparation),
         Stage(

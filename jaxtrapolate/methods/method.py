@@ -19,7 +19,7 @@ from typing import Any, Literal, get_args
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.checks import check_choice, missing_package
 from jaxtrapolate.methods.frames import Frames, buffer, cast, rendered, upcoming
@@ -44,6 +44,23 @@ class State:
 
 
 @dataclasses.dataclass(frozen=True)
+class Needed:
+    """On which frames a stage is needed at all; on others it is not run.
+
+    Compiled as a branch, of which one side runs: under vmap both do.
+
+    Attributes:
+        where: in words, as "there are holes".
+        test: `(state, values) -> bool []`.
+        instead: `(state, values) -> values`: what the stage would give on the others, of the same shapes and dtypes.
+    """
+
+    where: str
+    test: Callable[[Any, Values], Bool[Array, ""]]
+    instead: Callable[[Any, Values], dict[str, Any]]
+
+
+@dataclasses.dataclass(frozen=True)
 class Stage:
     """A named step of a method.
 
@@ -65,6 +82,7 @@ class Stage:
         on: the targets that it runs on: those that are generated (without colour), the rendered ones, or both.
         host: whether its function is no JAX code: it gets arrays and is never traced.
         extra: the optional dependency that it needs, as in `pip install "jaxtrapolate[extra]"`.
+        needed: on which frames it is; `None` = on all. No part of one on the host.
     """
 
     name: str
@@ -79,6 +97,7 @@ class Stage:
     on: Literal["generated", "rendered", "both"] = "generated"
     host: bool = False
     extra: str | None = None
+    needed: Needed | None = None
 
     @property
     def needs(self) -> frozenset[str]:
@@ -93,7 +112,11 @@ class Stage:
         """
         taken = {name: values[name] for name in self.needs}
         taken |= {name[:-1]: values.get(name[:-1]) for name in self.takes if name.endswith("?")}
-        given = self.function(state, taken)
+        if self.needed is None:
+            given = self.function(state, taken)
+        else:
+            test = self.needed.test(state, taken)
+            given = jax.lax.cond(test, self.function, self.needed.instead, state, taken)
         if set(given) != set(self.gives):
             raise ValueError(f"stage {self.name!r}: expected to give {_named(self.gives)}, got {_named(given)}")
         return given

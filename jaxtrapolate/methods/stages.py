@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.bidirectional.assisted import blend
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.frames import rendered
-from jaxtrapolate.methods.method import Stage, Values
+from jaxtrapolate.methods.method import Needed, Stage, Values
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.ops.holes import Taps, hole_masks
 from jaxtrapolate.ops.motion import chain_motion, occlusion_motion
@@ -152,7 +152,18 @@ def _occlusion(state, values: Values):
     return {"occlusion_motion": occlusion_motion(values["motion"], values["target"].gbuffer.depth)}
 
 
-OCCLUSION = Stage("occlusion motion", _occlusion, ("motion", "target"), ("occlusion_motion",), reads=("target.depth",))
+OCCLUSION = Stage(
+    "occlusion motion",
+    _occlusion,
+    takes=("motion", "target", "holes"),
+    gives=("occlusion_motion",),
+    reads=("target.depth",),
+    needed=Needed(
+        "there are holes",
+        lambda state, values: jnp.any(values["holes"]),
+        lambda state, values: {"occlusion_motion": values["motion"]},
+    ),
+)
 """The motion of what hid the holes."""
 
 

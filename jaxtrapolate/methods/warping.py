@@ -43,7 +43,7 @@ class WarpSettings:
 
 
 def warp() -> Method:
-    """The newest rendered frame, its colour as it is, fetched along the motion vectors."""
+    """The newest rendered frame, undivided, fetched along the motion vectors."""
 
     def function(state, values: Values):
         return {"image": backward_warp(values["newest"].color, values["motion"], filter=state.settings.filter)}
@@ -62,8 +62,8 @@ def occlusion_warp() -> Method:
 
     stages = (
         REPROJECT,
-        OCCLUSION,
         HOLES,
+        OCCLUSION,
         HINDSIGHT,
         demodulate_stage(),
         Stage("composite", function, ("layers", *COMPOSITE), ("warped", "image")),

@@ -70,12 +70,12 @@ def cut(image: Float[Array, "h w"], stride: int) -> Float[Array, "8 8 n"]:
     rows, columns = grid((image.shape[0], image.shape[1]), stride)
     padded = _covering(image, stride)
     ends = (rows - 1) * stride + 1, (columns - 1) * stride + 1
-    taps = [
-        padded[j : j + ends[0] : stride, i : i + ends[1] : stride].reshape(-1)
-        for j in range(PATCH)
-        for i in range(PATCH)
-    ]
-    return jnp.stack(taps).reshape(PATCH, PATCH, -1)
+
+    def tap(offset):
+        below = jax.lax.dynamic_slice(padded, (offset // PATCH, offset % PATCH), ends)
+        return below[::stride, ::stride].reshape(-1)
+
+    return jax.lax.map(tap, jnp.arange(PATCH * PATCH)).reshape(PATCH, PATCH, -1)
 
 
 def centres(image: Float[Array, "h w"], stride: int) -> Float[Array, " n"]:

@@ -45,11 +45,9 @@ def _terms(first, second, flow) -> _Terms:
     height, width = first.shape
     columns, rows = pixel_grid(height, width, first.dtype)
     warped = fetch(second, columns + jnp.real(flow), rows + jnp.imag(flow))
-    mean, change = once((first + warped) * 0.5), warped - first
-    x, y = (once(gradient(mean, axis)) for axis in (1, 0))
-    tx, ty = (once(gradient(change, axis)) for axis in (1, 0))
-    xx, xy, yy = once(gradient(x, 1)), once(gradient(x, 0)), once(gradient(y, 0))
-    return _Terms(once(change), x, y, tx, ty, xx, xy, yy)
+    mean, change = once(((first + warped) * 0.5, warped - first))
+    x, y, tx, ty = once([gradient(a, axis) for a in (mean, change) for axis in (1, 0)])
+    return _Terms(change, x, y, tx, ty, *once((gradient(x, 1), gradient(x, 0), gradient(y, 0))))
 
 
 def shifted(a, axis, by):
@@ -94,7 +92,7 @@ def _data(terms: _Terms, step, weights):
     slope = 0.5 * _GAMMA * _penalty(jnp.square(apart_x) / norm_x + jnp.square(apart_y) / norm_y)
     if weights is not None:
         grey, slope = grey * weights.pixels, slope * weights.pixels
-    grey, slope_x, slope_y = once(grey), once(slope / norm_x), once(slope / norm_y)
+    grey, slope_x, slope_y = once((grey, slope / norm_x, slope / norm_y))
     a = grey * x * x + slope_x * xx * xx + slope_y * xy * xy + _ZETA
     b = grey * x * y + slope_x * xx * xy + slope_y * xy * yy
     c = grey * y * y + slope_x * xy * xy + slope_y * yy * yy + _ZETA
@@ -104,11 +102,11 @@ def _data(terms: _Terms, step, weights):
     return a, b, c, right
 
 
-def _quarters(a):
-    """Pixels of even and odd rows and columns, four images; 0 beyond an odd edge."""
-    height, width = a.shape
-    a = jnp.pad(a, ((0, height % 2), (0, width % 2)))
-    return [[once(a[j::2, i::2]) for i in (0, 1)] for j in (0, 1)]
+def _quarters(images):
+    """Pixels of even and odd rows and columns, `[2, 2, images, ceil(h / 2), ceil(w / 2)]`; 0 beyond an odd edge."""
+    height, width = images[0].shape
+    stacked = jnp.pad(jnp.stack(images), ((0, 0), (0, height % 2), (0, width % 2)))
+    return stacked.reshape(len(images), -(-height // 2), 2, -(-width // 2), 2).transpose(2, 4, 0, 1, 3)
 
 
 def _whole(quarters, size):
@@ -121,18 +119,18 @@ def _relax(flow, inverse, right, around, sweeps):
 
     Pixels are coloured like a chessboard: all of one colour are made from those of the other at once.
     """
-    state = _quarters(flow)
-    parts = [_quarters(a) for a in (*inverse, right, *around)]
+    parts = _quarters([*inverse, jnp.real(right), jnp.imag(right), *around])
+    state = _quarters([flow])[:, :, 0]
 
     def update(state, j, i):
-        xx, xy, yy, given, left, right, above, below = (a[j][i] for a in parts)
+        xx, xy, yy, given_x, given_y, left, right, above, below = parts[j, i]
         beside, over = state[j][1 - i], state[1 - j][i]
         # of an even column the left neighbour is the odd one before
         to_left, to_right = (shifted(beside, 1, 1), beside) if i == 0 else (beside, shifted(beside, 1, -1))
         up, down = (shifted(over, 0, 1), over) if j == 0 else (over, shifted(over, 0, -1))
         terms = ((left, to_left), (right, to_right), (above, up), (below, down))
-        x = jnp.real(given) + sum(w * jnp.real(z) for w, z in terms)
-        y = jnp.imag(given) + sum(w * jnp.imag(z) for w, z in terms)
+        x = given_x + sum(w * jnp.real(z) for w, z in terms)
+        y = given_y + sum(w * jnp.imag(z) for w, z in terms)
         old = state[j][i]
         state[j][i] = jax.lax.complex(
             jnp.real(old) + _RELAXATION * (xx * x + xy * y - jnp.real(old)),
@@ -145,7 +143,7 @@ def _relax(flow, inverse, right, around, sweeps):
             update(state, j, i)
         return state, None
 
-    state, _ = jax.lax.scan(sweep, state, None, length=sweeps)
+    state, _ = jax.lax.scan(sweep, [list(line) for line in state], None, length=sweeps)
     return _whole(state, flow.shape)
 
 

@@ -52,21 +52,25 @@ def _by_strips_jvp(function, height, primals, tangents):
 
 
 @jax.custom_jvp
-def once(value: Array) -> Array:
-    """The value `[rows, ...]`, computed once.
+def once(values: T) -> T:
+    """The value `[rows, ...]`, or all of a tree of as many rows each, computed once.
 
     XLA on a CPU computes what several consumers read in each of them, and fuses a window with what it slides over; what
     a loop reads it computes before. (A scan that only hands its rows on is none: JAX takes it out.)
     """
 
-    def rows(value):
-        def step(number, result):
-            row = jax.lax.dynamic_index_in_dim(value, number, keepdims=True)
-            return jax.lax.dynamic_update_slice_in_dim(result, row, number, 0)
+    def rows(values):
+        def step(number, results):
+            def put(value, result):
+                row = jax.lax.dynamic_index_in_dim(value, number, keepdims=True)
+                return jax.lax.dynamic_update_slice_in_dim(result, row, number, 0)
 
-        return jax.lax.fori_loop(0, value.shape[0], step, jnp.zeros_like(value))
+            return jax.tree.map(put, values, results)
 
-    return jax.lax.platform_dependent(value, cpu=rows, default=lambda value: value)
+        empty = jax.tree.map(jnp.zeros_like, values)
+        return jax.lax.fori_loop(0, jax.tree.leaves(values)[0].shape[0], step, empty)
+
+    return jax.lax.platform_dependent(values, cpu=rows, default=lambda values: values)
 
 
 @once.defjvp
