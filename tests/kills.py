@@ -62,6 +62,13 @@ def start(arguments: list[str]) -> subprocess.Popen:
     )
 
 
+def complete(arguments: list[str]) -> None:
+    """Run a command to its end."""
+    process = start(arguments)
+    _, err = process.communicate()
+    assert process.returncode == 0, err
+
+
 def finished(folder: Path, command: str) -> dict[str, int]:
     """The files that are done, and when they were written."""
     patterns = {"generate": ("*.exr",), "evaluate": ("scores/[0-9]*.json",), "train": ("checkpoints/[0-9]*",)}
@@ -94,7 +101,7 @@ def trial(base: Path, command: str, arguments: list[str], what: signal.Signals, 
     reference = base / f"{command}-reference"
     begun = time.monotonic()
     if not reference.exists():
-        assert start([*arguments, str(reference)]).wait() == 0
+        complete([*arguments, str(reference)])
     length = float(reference.with_suffix(".seconds").read_text()) if reference.with_suffix(".seconds").exists() else 0
     if not length:
         length = time.monotonic() - begun
@@ -117,7 +124,9 @@ def trial(base: Path, command: str, arguments: list[str], what: signal.Signals, 
                 if what is signal.SIGINT:
                     # -2, which a shell shows as 130 too: Python itself was starting, or taking itself down after all
                     assert process.returncode in (0, 130, -2), (process.returncode, err)
-                    lines |= {err} if process.returncode == 130 else set()
+                    # a run may be struck after the line that says that it has come to its end
+                    said = [line for line in err.splitlines(True) if not line.startswith("8 steps of extranet: ")]
+                    lines |= {"".join(said)} if process.returncode == 130 else set()
             else:
                 _, err = process.communicate()
                 assert process.returncode == 0, err
@@ -162,7 +171,7 @@ def main(arguments: list[str] | None = None) -> list[dict]:
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(base / "cache"))
         dump = base / "dump"
         render = ["render", "demo", "--frames", "8", "--size", "160x90", "--output", str(dump)]
-        assert start(render).wait() == 0
+        complete(render)
         for command, words in commands(base, dump).items():
             for what in (signal.SIGKILL, signal.SIGINT):
                 if options.command in (None, command) and options.signal in (None, what.name[3:]):

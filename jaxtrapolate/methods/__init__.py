@@ -20,9 +20,9 @@ from jaxtrapolate.methods import (
 )
 from jaxtrapolate.methods.frames import neighbours as neighbours
 from jaxtrapolate.methods.method import Method as Method
-from jaxtrapolate.methods.method import Needed as Needed
 from jaxtrapolate.methods.method import Precision as Precision
-from jaxtrapolate.methods.method import Stage as Stage
+from jaxtrapolate.methods.stage import Needed as Needed
+from jaxtrapolate.methods.stage import Stage as Stage
 from jaxtrapolate.weights import default_weights
 
 _METHODS: dict[str, Callable[[], Method]] = {

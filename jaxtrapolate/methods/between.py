@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.bidirectional.flows import complete_flows
 from jaxtrapolate.methods.frames import Frames, rendered, upcoming
-from jaxtrapolate.methods.method import Stage, Values
+from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.methods.stages import chain
 from jaxtrapolate.precision import divide, widest
 from jaxtrapolate.records import Frame, Keyframe

@@ -20,8 +20,9 @@ from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.between import BETWEEN, CHAINED, FRAMES, PAIR, depth_of
 from jaxtrapolate.methods.frames import rendered, upcoming
 from jaxtrapolate.methods.hindsight import block_sums, from_blocks
-from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.methods.stages import SKY, Demodulation, chain, find_holes, reflecting
 from jaxtrapolate.methods.warping import GuidedSettings, fetch_guided, guides_of
 from jaxtrapolate.ops.depth import apart as depth_apart

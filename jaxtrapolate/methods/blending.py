@@ -5,8 +5,9 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.bidirectional.assisted import blend as mix
 from jaxtrapolate.methods.between import BETWEEN, FLOWS, PAIR, depth_of
-from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.ops.fill import fill_pyramid
 from jaxtrapolate.ops.radiance import tonemap
 from jaxtrapolate.ops.scatter import splat

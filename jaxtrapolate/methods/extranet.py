@@ -18,8 +18,9 @@ from jaxtyping import Array, Float
 from jaxtrapolate.checks import check_choice
 from jaxtrapolate.errors import printable
 from jaxtrapolate.methods.hindsight import hindsight_stage
-from jaxtrapolate.methods.method import Method, Needed, Stage, Values
+from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import settings
+from jaxtrapolate.methods.stage import Needed, Stage, Values
 from jaxtrapolate.methods.stages import (
     COMPOSITE,
     OCCLUSION,

@@ -4,9 +4,10 @@ The papers' warps go forward from one frame; see `jaxtrapolate.ops.grid.grid_war
 """
 
 from jaxtrapolate.methods.between import BETWEEN, FLOWS, PAIR, depth_of
-from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.reprojection import CAMERA, LINEAR, NEWEST, ONWARD, carried_depth
+from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.ops.fill import fill_pyramid
 from jaxtrapolate.ops.grid import grid_warp as warp_grid
 

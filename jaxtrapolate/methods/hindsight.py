@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.frames import rendered
-from jaxtrapolate.methods.method import Stage, Values
+from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.methods.stages import chain, reflecting
 from jaxtrapolate.ops.radiance import By, compress, demodulate, modulate
 from jaxtrapolate.ops.warp import backward_warp, landing, sample

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from flax import nnx
 
 from jaxtrapolate.methods.between import PAIR
-from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.method import Method
+from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.networks.explained import standing
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.networks.interpolator import Interpolator, InterpolatorConfig

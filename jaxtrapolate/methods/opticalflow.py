@@ -6,8 +6,9 @@ from jaxtyping import Array, Float
 from jaxtrapolate.bidirectional.assisted import blend as mix
 from jaxtrapolate.methods.between import PAIR
 from jaxtrapolate.methods.blending import evenly
-from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.ops.dis import Preset, dis_flow
 from jaxtrapolate.ops.radiance import srgb_encode, tonemap
 from jaxtrapolate.ops.warp import backward_warp

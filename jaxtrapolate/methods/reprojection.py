@@ -13,8 +13,9 @@ from jaxtrapolate.bidirectional.flows import camera_flow
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.between import depth_of
 from jaxtrapolate.methods.frames import Frames, rendered
-from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.methods.stages import REPROJECT, SKY
 from jaxtrapolate.ops.depth import changed
 from jaxtrapolate.ops.fill import fill_around

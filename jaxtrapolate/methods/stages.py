@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 from jaxtrapolate.bidirectional.assisted import blend
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.frames import rendered
-from jaxtrapolate.methods.method import Needed, Stage, Values
 from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.stage import Needed, Stage, Values
 from jaxtrapolate.ops.holes import Taps, hole_masks
 from jaxtrapolate.ops.motion import chain_motion, occlusion_motion
 from jaxtrapolate.ops.radiance import By, demodulate, modulate

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 
 from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.methods.hindsight import HINDSIGHT
-from jaxtrapolate.methods.method import Method, Stage, Values
+from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.methods.stages import (
     COMPOSITE,
     HOLES,

@@ -51,14 +51,17 @@ def _by_strips_jvp(function, height, primals, tangents):
     return jax.jvp(lambda sources: function(sources, 0, height), primals, tangents)
 
 
-@jax.custom_jvp
 def once(values: T) -> T:
     """The value `[rows, ...]`, or all of a tree of as many rows each, computed once.
 
     XLA on a CPU computes what several consumers read in each of them, and fuses a window with what it slides over; what
     a loop reads it computes before. (A scan that only hands its rows on is none: JAX takes it out.)
     """
+    return _once(values)
 
+
+@jax.custom_jvp
+def _once(values):
     def rows(values):
         def step(number, results):
             def put(value, result):
@@ -73,6 +76,6 @@ def once(values: T) -> T:
     return jax.lax.platform_dependent(values, cpu=rows, default=lambda values: values)
 
 
-@once.defjvp
+@_once.defjvp
 def _once_jvp(primals, tangents):
-    return once(*primals), *tangents
+    return _once(*primals), *tangents

@@ -8,8 +8,11 @@ import math
 import os
 import re
 import stat
+import sys
+import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -153,6 +156,8 @@ def load_orbax(directory: str | PathLike[str]) -> Weights:
     except (OSError, RuntimeError) as error:  # a link that leads back to itself is a RuntimeError
         raise ValueError(printable(f"{source}: no Orbax checkpoint ({error})")) from error
     metadata: dict[str, Any] = {"method": None, "config": {}, "note": ""}
+    hook = sys.unraisablehook
+    sys.unraisablehook = partial(_unraisable, hook)
     try:  # by handlers: a checkpointer warns of every item that is not asked for
         handler = ocp.PyTreeCheckpointHandler()
         stated = handler.metadata(epath.Path(item))
@@ -167,10 +172,22 @@ def load_orbax(directory: str | PathLike[str]) -> Weights:
                 epath.Path(folder / "metadata"), args=ocp.args.JsonRestore()
             )
         check_values(metadata)
-        return Weights(**_stated(metadata), tree=nested(named(tree)), source=source)
+        weights = Weights(**_stated(metadata), tree=nested(named(tree)), source=source)
+        sys.unraisablehook = hook
+        return weights
     except Exception as error:  # what Orbax raises on a damaged checkpoint is not documented
+        warnings.filterwarnings("ignore", r"coroutine '\w*Handler\.\w+' was never awaited", RuntimeWarning)
         reason = " ".join(str(error).split())[:200]
         raise ValueError(printable(f"{source}: damaged Orbax checkpoint ({reason})")) from error
+
+
+def _unraisable(otherwise: Callable[[Any], Any], raised: Any) -> None:
+    """Says nothing of arrays that Orbax was still reading when one was damaged: they find their event loop closed.
+
+    That may be after the refusal, so the hook stays then; everything else it passes on.
+    """
+    if not (isinstance(raised.exc_value, RuntimeError) and str(raised.exc_value) == "Event loop is closed"):
+        otherwise(raised)
 
 
 def _check_files(folder: Path, source: str) -> None:
