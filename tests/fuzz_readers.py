@@ -34,8 +34,19 @@ import numpy as np
 SECONDS = 10
 ADDRESS_SPACE = 24 << 30
 PROGRAMS = ("gs", "gswin32c", "gswin64c", "convert", "magick", "ffmpeg", "dcraw", "netpbm", "djpeg", "xdg-open", "sh")
-KINDS = ("exr", "png", "tiff", "image", "toml", "json", "npz", "torch", "orbax")
-SHARES = {"exr": 8, "png": 5, "tiff": 5, "image": 5, "toml": 4, "json": 2, "npz": 3, "torch": 5, "orbax": 1}
+KINDS = ("exr", "png", "tiff", "image", "toml", "json", "npz", "torch", "orbax", "jitter")
+SHARES = {
+    "exr": 8,
+    "png": 5,
+    "tiff": 5,
+    "image": 5,
+    "toml": 4,
+    "json": 2,
+    "npz": 3,
+    "torch": 5,
+    "orbax": 1,
+    "jitter": 2,
+}
 
 
 # -- good files
@@ -53,6 +64,7 @@ def good_files(folder: Path, kinds=KINDS) -> dict[str, list[Path]]:
         "npz": _npz,
         "torch": _torch,
         "orbax": _orbax,
+        "jitter": _jitter,
     }
     found = {}
     for kind in kinds:
@@ -147,6 +159,7 @@ depth = { file = "{frame:04d}.png", channels = ["R"], scale = 0.01, offset = 1e3
 sky = { file = "{frame:04d}.png", layer = "View.Depth", channels = "R", above = 1e9, srgb = false }
 motion = { file = "{frame:04d}.png", codes = true, valid = "B", channels = "RG" }
 """
+JITTERED = range(1, 8)
 RUN = {"task": "extranet", "steps": 100, "optimizer": {"peak_learning_rate": 0.001}, "options": {"crop": [64, 64]}}
 
 
@@ -166,6 +179,11 @@ def _toml(folder):
 
 def _json(folder):
     (folder / "config.json").write_text(json.dumps(RUN))
+
+
+def _jitter(folder):
+    lines = ["frame x y"] + [f"{k}, {k / 8 - 0.5}; {0.5 - k / 8}  # Halton" for k in JITTERED]
+    (folder / "jitter.txt").write_text("\n".join(lines))
 
 
 def _npz(folder):
@@ -432,6 +450,10 @@ SPECIAL: dict[str, list[Callable[[Path, Path], Path]]] = {
         _file("a.toml", b"x" * (17 << 20)),
     ],
     "json": [*_hostile("a.json"), _file("a.json", b"[" * 100_000), _file("a.json", b"9" * 5000)],
+    "jitter": [
+        *_hostile("jitter.txt"),
+        *(_file("jitter.txt", line) for line in (b"1 1e999 nan", b"9" * 5000 + b" 0 0", b"-1 0 0", b"1 0 0\n1 0 0")),
+    ],
     "npz": _hostile("extranet-12345678.npz"),
     "torch": [
         *_hostile("a.pth.tar"),
@@ -449,6 +471,7 @@ def read(kind: str, path: Path) -> None:
     from jaxtrapolate import weights
     from jaxtrapolate.files import exr, image, open_sequence
     from jaxtrapolate.files.description import read_settings
+    from jaxtrapolate.files.jitter import JitterFile, read_jitter
     from jaxtrapolate.files.text import read_json
     from jaxtrapolate.methods.extranet import load_extranet
     from jaxtrapolate.training.config import load_config
@@ -457,6 +480,7 @@ def read(kind: str, path: Path) -> None:
         "exr": (exr.exr_size, exr.exr_channels, exr.read_exr, sequence),
         "toml": (read_settings, load_config, open_sequence),
         "json": (read_json,),
+        "jitter": (lambda path: read_jitter(path, JitterFile(path.name), JITTERED, (9, 16)),),
         "npz": (weights.load_weights,),
         "torch": (load_extranet if path.stat().st_size < 500 else weights.read_torch,)
         if path.is_file()

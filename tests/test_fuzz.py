@@ -3,7 +3,7 @@
 import fuzz_readers
 import pytest
 
-SHORT = {"exr": 30, "png": 20, "tiff": 20, "image": 20, "toml": 30, "json": 12, "npz": 15, "torch": 20}
+SHORT = {"exr": 30, "png": 20, "tiff": 20, "image": 20, "toml": 30, "json": 12, "npz": 15, "torch": 20, "jitter": 12}
 
 
 def test_a_few_inputs_of_every_kind(tmp_path, monkeypatch, capfd):

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import slow
 
 import jaxtrapolate as jx
 from jaxtrapolate.evaluation.score import display
@@ -19,10 +20,6 @@ PRESETS = {"ultrafast": 0, "fast": 1, "medium": 2}  # OpenCV's numbers
 @pytest.fixture(autouse=True)
 def plain(unchecked):
     """NumPy arrays are taken, and the library's own errors seen."""
-
-
-def slow(*values):
-    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
 
 
 def texture(size=SIZE, *, seed=0):
@@ -79,7 +76,7 @@ def opencv_dis(first, second, *, preset="medium"):
     return cv2.DISOpticalFlow.create(PRESETS[preset]).calc(first, second, None)
 
 
-@pytest.mark.parametrize("gaussian", [False, True])
+@pytest.mark.parametrize("gaussian", [False, *slow(True)])
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_farneback_is_opencvs(motion, gaussian):
     """The same polynomials, equations and windows; OpenCV compares what leaves the frame with 0."""
@@ -93,7 +90,7 @@ def test_farneback_is_opencvs(motion, gaussian):
 
 @pytest.mark.parametrize(
     "preset",
-    ["medium", pytest.param("fast", marks=pytest.mark.slow), pytest.param("ultrafast", marks=pytest.mark.slow)],
+    ["medium", *slow("fast", "ultrafast")],
 )
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_dis_is_near_opencvs(motion, preset):
@@ -155,7 +152,7 @@ def test_what_is_not_finite_stays_local(name):
     assert np.isfinite(FLOWS[name](np.full_like(first, np.nan), second)).all()
 
 
-@pytest.mark.parametrize("name", FLOWS)
+@pytest.mark.parametrize("name", ["farneback", *slow("dis")])
 @pytest.mark.parametrize("dtype", [jnp.bfloat16, *slow(jnp.float16)])
 def test_half_precision_is_computed_in_float32(name, dtype):
     first, second = (jnp.asarray(given(codes)[:18, :21]).astype(dtype) for codes in moved("slide")[:2])

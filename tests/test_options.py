@@ -1,12 +1,14 @@
 """Options of methods: what there is, what they may be, that they count, and what is compiled anew."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import small_extranet
+from marks import slow_rows
 from synthetic import make_frame
 
 import jaxtrapolate as jx
@@ -95,7 +97,7 @@ def test_values_are_held_as_the_field_has_them():
 
 
 def test_numbers_change_without_compiling_anew():
-    method, traces = jx.load("guided_warp"), []
+    method, traces = jx.load("occlusion_warp"), []
     first, *rest = method.stages
 
     def counted(state, values):
@@ -104,15 +106,15 @@ def test_numbers_change_without_compiling_anew():
 
     counting = dataclasses.replace(method, stages=(dataclasses.replace(first, function=counted), *rest))
     history, target, _ = window()
-    images = [counting.replace(sigma_guide=s)(history, target) for s in (0.03, 0.1, 1.0)]
+    images = [counting.replace(floor=floor)(history, target) for floor in (0.01, 0.1, 1.0)]
     assert len(traces) == 1
     assert not np.array_equal(images[0], images[2])
     np.testing.assert_array_equal(counting(history, target), images[0])
-    one = counting.replace(keep=1)
-    first_of_one = one(history, target)
+    plain = counting.replace(by="none")
+    first_of_plain = plain(history, target)
     assert len(traces) == 2
-    assert not np.array_equal(first_of_one, images[0])
-    one.replace(floor=0.5).replace(margin=1.0)(history, target)
+    assert not np.array_equal(first_of_plain, images[0])
+    plain.replace(floor=0.5).replace(margin=1.0)(history, target)
     assert len(traces) == 2
 
 
@@ -152,11 +154,15 @@ def test_options_are_swept_and_fitted():
         ("bidirectional_image", {"iterations": 0, "starts": ("default",)}),
         pytest.param("bidirectional_image", {"visibility": "inside"}, marks=pytest.mark.slow),
         pytest.param("bidirectional_guided", {"keep": 1}, marks=pytest.mark.slow),
-        ("dis", {"preset": "ultrafast"}),
+        pytest.param("dis", {"preset": "ultrafast"}, marks=pytest.mark.slow),
+        ("warp", {"space": "tone"}),
+        pytest.param("dis", {"space": "log"}, marks=pytest.mark.slow),
+        pytest.param("warp_3d", {"space": "tone"}, marks=pytest.mark.slow),
+        pytest.param("bidirectional_guided", {"space": "tone"}, marks=pytest.mark.slow),
     ],
 )
 def test_options_count(name, options):
-    method = jx.load(name)
+    method = loaded(name)
     if method.future:
         history, target, future = between()
     else:
@@ -166,12 +172,23 @@ def test_options_count(name, options):
     assert not np.array_equal(method(history, target, future), other)
 
 
+@functools.cache
+def loaded(name):
+    """The method, compiled once for all tests."""
+    return jx.load(name)
+
+
 # Precision
 
 
-@pytest.mark.parametrize("name", ["warp", "guided_warp"])
 @pytest.mark.parametrize(
-    ("dtype", "least"), [("float16", 60), pytest.param("bfloat16", 38, marks=pytest.mark.slow), ("float32", 100)]
+    ("name", "dtype", "least"),
+    [
+        ("warp", "float16", 60),
+        ("warp", "float32", 100),
+        ("guided_warp", "float32", 100),
+        *slow_rows(("warp", "bfloat16", 38), ("guided_warp", "float16", 60), ("guided_warp", "bfloat16", 38)),
+    ],
 )
 def test_a_method_in_another_precision(name, dtype, least):
     """The error is that of the colours' own digits, once or twice; the image has the colours' dtype."""

@@ -6,6 +6,7 @@ frame after, turned around, to that, and what is visible in both is blended. Wit
 """
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from jaxtrapolate.methods.frames import rendered, upcoming
 from jaxtrapolate.methods.hindsight import block_sums, from_blocks
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.space import Space, in_space, space
 from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.methods.stages import SKY, Demodulation, chain, find_holes, reflecting
 from jaxtrapolate.methods.warping import GuidedSettings, fetch_guided, guides_of
@@ -55,7 +57,9 @@ class SearchSettings:
 
 @settings
 class AssistedSettings(SearchSettings, Demodulation):
-    """Of demodulation, and of the search where nothing was drawn of the target."""
+    """Of demodulation, of the fetch, and of the search where nothing was drawn of the target."""
+
+    space: Space = space()
 
 
 def depth_kind(*frames: Frame) -> DepthKind:
@@ -189,8 +193,11 @@ _FETCHED = ("fetched", "weight", "both")
 
 
 def _fetch(state, values: Values):
-    pairs = zip(_layers(values, state.settings), ("to_previous", "to_next"), strict=True)
-    fetched = tuple(backward_warp(layers, values[motion]) for layers, motion in pairs)
+    how = state.settings
+    pairs = zip(_layers(values, how), ("to_previous", "to_next"), strict=True)
+    fetched = tuple(
+        in_space(how.space, partial(backward_warp, motion=values[motion]), layers) for layers, motion in pairs
+    )
     return {"fetched": fetched, "weight": _weight(values), "both": values["seen"][0] & values["seen"][1]}
 
 
@@ -203,8 +210,9 @@ def _guided_fetch(state, values: Values):
     frames, motions = (values["previous"], values["next"]), (values["to_previous"], values["to_next"])
     both = zip(frames, _layers(values, state.settings), motions, values["seen"], strict=True)
     for frame, given, motion, seen in both:
-        layers = fetch_guided(given, motion, ~seen, values["target"].gbuffer, frame.gbuffer, state.settings)
-        color = backward_warp(given[..., -3:], motion)
+        buffers = values["target"].gbuffer, frame.gbuffer
+        layers = fetch_guided(given, motion, ~seen, *buffers, state.settings, state.settings.space)
+        color = in_space(state.settings.space, partial(backward_warp, motion=motion), given[..., -3:])
         color = jnp.where(seen, color, layers[..., -3:])  # so that what stands still is exact
         fetched.append(jnp.concatenate([layers[..., :-3], color], -1))
         inside.append(in_frame(motion)[..., None])

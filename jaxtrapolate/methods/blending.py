@@ -1,5 +1,7 @@
 """Baselines that mix the rendered frames around the target, their colours undivided: nothing is demodulated."""
 
+from functools import partial
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -7,6 +9,7 @@ from jaxtrapolate.bidirectional.assisted import blend as mix
 from jaxtrapolate.methods.between import BETWEEN, FLOWS, PAIR, depth_of
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.space import Space, in_space, space
 from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.ops.fill import fill_pyramid
 from jaxtrapolate.ops.radiance import tonemap
@@ -21,6 +24,14 @@ class SoftmaxSettings:
 
     by_depth: float = option(5.0, "how much the nearer pixel prevails: exponents at infinite depth", low=0)
     by_color: float = option(10.0, "the same by colour, where there is no depth: per display value", low=0)
+    space: Space = space()
+
+
+@settings
+class FetchSettings:
+    """Of how colours are fetched."""
+
+    space: Space = space()
 
 
 def evenly(alpha: Array, image: Array) -> Float[Array, "h w 1"]:
@@ -56,13 +67,15 @@ def half_motion() -> Method:
 
     def function(state, values: Values):
         between = values["between"]
-        return {"image": backward_warp(values["previous"].color, weigh(between, values["alpha"].astype(between.dtype)))}
+        fetch = partial(backward_warp, motion=weigh(between, values["alpha"].astype(between.dtype)))
+        return {"image": in_space(state.settings.space, fetch, values["previous"].color)}
 
     return Method(
         "half_motion",
         (PAIR, BETWEEN, Stage("fetch", function, ("previous", "between", "alpha"), ("image",))),
         kind="interpolation",
         future=1,
+        settings=FetchSettings(),
     )
 
 
@@ -115,7 +128,8 @@ def softmax_splat() -> Method:
             ("next", "backward", 1 - alpha, values["exponents"][1]),
         ):
             color, motion = values[name].color, weigh(values[flow], passed.astype(values[flow].dtype))
-            warped = splat(color, motion, weights=weights.astype(color.dtype), mode="softmax")
+            push = partial(splat, motion=motion, weights=weights.astype(color.dtype), mode="softmax")
+            warped = in_space(state.settings.space, push, color)
             landed = splat(jnp.ones_like(color[..., :1]), motion, mode="sum")
             sides.append((warped, jnp.minimum(landed, 1)))
         (first, in_first), (second, in_second) = sides

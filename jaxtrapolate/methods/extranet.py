@@ -6,6 +6,7 @@ Histories are warped demodulated, holes are marked, and the network answers in t
 
 import dataclasses
 from collections.abc import Mapping
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -20,6 +21,7 @@ from jaxtrapolate.errors import printable
 from jaxtrapolate.methods.hindsight import hindsight_stage
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import settings
+from jaxtrapolate.methods.space import Space, in_space
 from jaxtrapolate.methods.stage import Needed, Stage, Values
 from jaxtrapolate.methods.stages import (
     COMPOSITE,
@@ -33,7 +35,7 @@ from jaxtrapolate.methods.stages import (
     reflecting,
     reproject_stage,
 )
-from jaxtrapolate.methods.warping import GUIDED, Guide
+from jaxtrapolate.methods.warping import Guide, guided_stage
 from jaxtrapolate.networks.explained import explained, standing
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig, extranet_from_torch
 from jaxtrapolate.networks.inference import inference
@@ -63,6 +65,7 @@ class Preparation:
         depth: "relative" is m / (m + depth), m the harmonic mean over the frame: 1/2 there, 0 at the sky. "minmax" is
             the release's: depth in centimetres, what is beyond 10 km 0, min and max over the frame to 0 and 1.
         sky_normal: what is fed, in each channel, for the normal of the sky.
+        space: in which colours are fetched between pixels.
     """
 
     first_guess: Literal["warp", "guided"] = "warp"
@@ -74,6 +77,7 @@ class Preparation:
     position_threshold: tuple[float, float, float] | None = None
     depth: Literal["relative", "minmax"] = "relative"
     sky_normal: float = 0.0
+    space: Space = "linear"
 
     def __post_init__(self):
         for name, choices in _CHOICES.items():
@@ -88,6 +92,7 @@ _CHOICES = {
     "outside": ("edge", "zero"),
     "taps": get_args(Taps),
     "depth": ("relative", "minmax"),
+    "space": get_args(Space),
 }
 
 RELEASE = Preparation(
@@ -189,7 +194,8 @@ def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
         warped = [encode(image) for image in values["histories"]]
         first = encode(values["warped"][..., :3])
         valid = [1 - mask.astype(first.dtype) for mask in values["masks"]]
-        guesses = [first, encode(composite(values, values["layers"][0][..., :3], outside=preparation.outside))]
+        along = partial(composite, values, outside=preparation.outside)
+        guesses = [first, encode(in_space(preparation.space, along, values["layers"][0][..., :3]))]
         sources = [jnp.concatenate(pair, -1) for pair in zip(warped, valid, strict=True)]
         sources = [sources[min(k, len(sources) - 1)] for k in range(config.histories)]
         inputs = {
@@ -239,11 +245,18 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
     if config.features not in (0, 6) or not 1 <= config.warps <= 2:
         raise ValueError(f"model: expected 6 features or none and 1 or 2 warped images, got {config}")
     function, weights = inference(model)
-    guided = (dataclasses.replace(GUIDED, optional=True),) if preparation.first_guess == "guided" else ()
+    guided = (
+        (dataclasses.replace(guided_stage(preparation.space), optional=True),)
+        if preparation.first_guess == "guided"
+        else ()
+    )
 
     def warp(state, values: Values):
         pairs = zip(values["layers"], values["motions"], strict=True)
-        warped = tuple(backward_warp(image, motion, outside=preparation.outside) for image, motion in pairs)
+        warped = tuple(
+            in_space(preparation.space, partial(backward_warp, motion=motion, outside=preparation.outside), image)
+            for image, motion in pairs
+        )
         return {"histories": tuple(image[..., :3] for image in warped), "warped": warped[0]}
 
     def network(state, values: Values):

@@ -3,10 +3,13 @@
 The papers' warps go forward from one frame; see `jaxtrapolate.ops.grid.grid_warp` for what departs from them.
 """
 
+import jax.numpy as jnp
+
 from jaxtrapolate.methods.between import BETWEEN, FLOWS, PAIR, depth_of
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.reprojection import CAMERA, LINEAR, NEWEST, ONWARD, carried_depth
+from jaxtrapolate.methods.space import Space, in_space, space
 from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.ops.fill import fill_pyramid
 from jaxtrapolate.ops.grid import grid_warp as warp_grid
@@ -18,6 +21,18 @@ class GridSettings:
 
     cell: int = option(4, "the width of a cell in pixels", low=1, high=256)
     tear: float = option(2.0, "a cell is torn where an edge gets longer by this factor", low=1, high=1e6)
+    space: Space = space()
+
+
+def _warped(image, moved, how: GridSettings):
+    """The image on its moved grid, and where it is covered."""
+
+    def fetch(image):
+        warped, covered = warp_grid(image, *moved, cell=how.cell, tear=how.tear)
+        return jnp.concatenate([covered[..., None].astype(warped.dtype), warped], -1)
+
+    found = in_space(how.space, fetch, image)
+    return {"warped": found[..., 1:], "covered": found[..., 0] > 0}
 
 
 def _fill(state, values: Values):
@@ -39,8 +54,7 @@ def grid_warp() -> Method:
     def function(state, values: Values):
         previous = values["previous"]
         moved = values["forward"], depth_of(previous), values["alpha"]
-        warped, covered = warp_grid(previous.color, *moved, cell=state.settings.cell, tear=state.settings.tear)
-        return {"warped": warped, "covered": covered}
+        return _warped(previous.color, moved, state.settings)
 
     warp = Stage("grid warp", function, ("previous", "forward", "alpha"), ("warped", "covered"))
     stages = (PAIR, BETWEEN, FLOWS, warp, _FILL)
@@ -55,10 +69,7 @@ def grid_extrapolate() -> Method:
 
     def function(state, values: Values):
         depth = None if depth_of(values["newest"]) is None else carried_depth(values)
-        warped, covered = warp_grid(
-            values["newest"].color, values["onward"], depth, 1.0, cell=state.settings.cell, tear=state.settings.tear
-        )
-        return {"warped": warped, "covered": covered}
+        return _warped(values["newest"].color, (values["onward"], depth, 1.0), state.settings)
 
     warp = Stage("grid warp", function, ("newest", "onward", "deeper"), ("warped", "covered"))
     stages = (NEWEST, LINEAR, CAMERA, ONWARD, warp, _FILL)

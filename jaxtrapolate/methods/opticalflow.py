@@ -1,5 +1,7 @@
 """Interpolation by optical flow: what a display or a video player does, which knows nothing but the images."""
 
+from functools import partial
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -8,6 +10,7 @@ from jaxtrapolate.methods.between import PAIR
 from jaxtrapolate.methods.blending import evenly
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.space import Space, in_space, space
 from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.ops.dis import Preset, dis_flow
 from jaxtrapolate.ops.radiance import srgb_encode, tonemap
@@ -32,6 +35,7 @@ class FlowSettings:
     """Of the optical flow."""
 
     preset: Preset = option("medium", "of dis_flow: the better, the slower", choices=Preset)
+    space: Space = space()
 
 
 def dis() -> Method:
@@ -42,8 +46,8 @@ def dis() -> Method:
     alpha (1 - alpha) B.
 
     References: Kroeger et al. 2016 for the flow, Jiang et al. 2018 (Super SloMo), equation 4, for that of the target.
-    Departures: no occlusion is reasoned about; colours are fetched and mixed as linear radiance, like everywhere here,
-    where a video player mixes display values.
+    Departures: no occlusion is reasoned about; colours are fetched as linear radiance unless said, where a video player
+    fetches display values.
     """
 
     def flow(state, values: Values):
@@ -55,8 +59,11 @@ def dis() -> Method:
         forward, backward = values["forward"], values["backward"]
         alpha = values["alpha"].astype(forward.dtype)
         rest = 1 - alpha
-        first = backward_warp(values["previous"].color, alpha * (alpha * backward - rest * forward))
-        second = backward_warp(values["next"].color, rest * (rest * forward - alpha * backward))
+        motions = alpha * (alpha * backward - rest * forward), rest * (rest * forward - alpha * backward)
+        first, second = (
+            in_space(state.settings.space, partial(backward_warp, motion=motion), values[name].color)
+            for name, motion in zip(pair, motions, strict=True)
+        )
         return {"image": mix(first, second, evenly(alpha, first))}
 
     pair, flows = ("previous", "next"), ("forward", "backward")

@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -15,6 +16,7 @@ from jaxtrapolate.methods.between import depth_of
 from jaxtrapolate.methods.frames import Frames, rendered
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.space import Space, in_space, space
 from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.methods.stages import REPROJECT, SKY
 from jaxtrapolate.ops.depth import changed
@@ -34,6 +36,7 @@ class DepthTest:
     """Of the test whether two depths are of one point."""
 
     epsilon: float = option(0.05, "the relative difference of depths of one point is less", low=0)
+    space: Space = space()
 
 
 def reprojection(shade: Shade | None = None) -> Method:
@@ -72,7 +75,8 @@ def reprojection(shade: Shade | None = None) -> Method:
         }
 
     def fetch(state, values: Values):
-        image = backward_warp(values["newest"].color, values["motion"])
+        fetch = partial(backward_warp, motion=values["motion"])
+        image = in_space(state.settings.space, fetch, values["newest"].color)
         if shade is not None:
             missed = ~in_frame(values["motion"]) if values["missed"] is None else values["missed"]
             image = jnp.where(missed[..., None], shade(values["target"], missed).astype(image.dtype), image)
@@ -192,7 +196,7 @@ def warp_3d() -> Method:
     """
 
     def push(state, values: Values):
-        color, onward, depth = values["newest"].color, values["onward"], carried_depth(values)
+        color, onward, depth, how = values["newest"].color, values["onward"], carried_depth(values), state.settings
         own = depth_of(values["newest"])
         own = depth if own is None else own
         layers = jnp.concatenate([-onward, *(a.astype(onward.dtype) for a in (depth, own, color))], -1)
@@ -202,9 +206,11 @@ def warp_3d() -> Method:
             pushed, covered = splat_nearest(layers, onward, depth, footprint=footprint)
             back, expected, whole = pushed[..., :2], pushed[..., 3:4], pushed[..., 4:]
             found = backward_warp(own, back, filter="nearest")
-            same = agree(found, expected, jnp.asarray(state.settings.epsilon, found.dtype), "metric")
+            same = agree(found, expected, jnp.asarray(how.epsilon, found.dtype), "metric")
             return (
-                jnp.where(same, backward_warp(color, back), whole.astype(color.dtype)),
+                jnp.where(
+                    same, in_space(how.space, partial(backward_warp, motion=back), color), whole.astype(color.dtype)
+                ),
                 pushed[..., 2:3],
                 covered,
                 same,

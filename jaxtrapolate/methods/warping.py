@@ -1,5 +1,6 @@
 """The methods without weights that warp the newest rendered frame."""
 
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.methods.hindsight import HINDSIGHT
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.space import Space, in_space, space
 from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.methods.stages import (
     COMPOSITE,
@@ -41,24 +43,34 @@ class WarpSettings:
     """How a frame is fetched."""
 
     filter: Filter = option("bilinear", "how colours are interpolated between pixels", choices=Filter)
+    space: Space = space()
 
 
 def warp() -> Method:
     """The newest rendered frame, undivided, fetched along the motion vectors."""
 
     def function(state, values: Values):
-        return {"image": backward_warp(values["newest"].color, values["motion"], filter=state.settings.filter)}
+        how = state.settings
+        fetch = partial(backward_warp, motion=values["motion"], filter=how.filter)
+        return {"image": in_space(how.space, fetch, values["newest"].color)}
 
     return Method(
         "warp", (REPROJECT, Stage("warp", function, ("newest", "motion"), ("image",)), SKY), settings=WarpSettings()
     )
 
 
+@settings
+class OcclusionSettings(Demodulation):
+    """Of demodulation and of the warp."""
+
+    space: Space = space()
+
+
 def occlusion_warp() -> Method:
     """The demodulated frame along the motion, in holes along the occluder's (the occlusion composite of ExtraNet)."""
 
     def function(state, values: Values):
-        warped = composite(values, values["layers"][0])
+        warped = in_space(state.settings.space, partial(composite, values), values["layers"][0])
         return {"warped": warped, "image": warped[..., :3]}
 
     stages = (
@@ -71,7 +83,7 @@ def occlusion_warp() -> Method:
         modulate_stage(),
         SKY,
     )
-    return Method("occlusion_warp", stages, past=2, settings=Demodulation())
+    return Method("occlusion_warp", stages, past=2, settings=OcclusionSettings())
 
 
 _GUIDES = ("albedo", "normal")
@@ -97,6 +109,8 @@ class Guide:
 class GuidedSettings(Guide, Demodulation):
     """Of demodulation and of the guided warp."""
 
+    space: Space = space()
+
 
 def guides(target, source, motion):
     """The guides `[H, W, G]` of both frames: albedo and normal, those that both have; else stencil and depth, likewise.
@@ -120,7 +134,7 @@ def guides_of(role: str) -> str:
     return "|".join(f"target+{role}.{name}" for name in (*_GUIDES, *_INSTEAD))
 
 
-def fetch_guided(image, motion, holes, target, source, how: Any):
+def fetch_guided(image, motion, holes, target, source, how: Any, space: Space):
     """The image by the guided warp along the motion; in holes as far off as in a frame of about `how.rows` rows.
 
     From twice that many rows on, holes are first led to a like surface by a coarse search (`far_motion`); `None` leaves
@@ -131,23 +145,28 @@ def fetch_guided(image, motion, holes, target, source, how: Any):
     if step > 1:
         motion = far_motion(motion, target_guide, source_guide, holes, step=step, unlike=how.unlike)
     sigmas = {"sigma_guide": how.sigma_guide, "sigma_space": how.sigma_space}
-    return guided_warp(image, motion, target_guide, source_guide, strides=how.strides, keep=how.keep, **sigmas)
+
+    def fetch(image):
+        return guided_warp(image, motion, target_guide, source_guide, strides=how.strides, keep=how.keep, **sigmas)
+
+    return in_space(space, fetch, image)
 
 
-def _guided(state, values: Values):
-    frames = values["target"].gbuffer, values["newest"].gbuffer
-    warped = fetch_guided(values["layers"][0], values["motion"], values["holes"], *frames, state.settings)
-    return {"warped": warped, "image": warped[..., :3]}
+def guided_stage(space: Space | None = None) -> Stage:
+    """Fetches the newest layer from the most similar pixels around where the motion leads; see `fetch_guided`.
 
+    Args:
+        space: `None` = the method's option.
+    """
 
-GUIDED = Stage(
-    "guided warp",
-    _guided,
-    takes=("target", "newest", "layers", "motion", "holes"),
-    gives=("warped", "image"),
-    reads=(guides_of("newest"),),
-)
-"""Fetches the newest layer from the most similar pixels around where the motion leads; see `fetch_guided`."""
+    def function(state, values: Values):
+        frames, how = (values["target"].gbuffer, values["newest"].gbuffer), state.settings
+        layer, motion, holes = values["layers"][0], values["motion"], values["holes"]
+        warped = fetch_guided(layer, motion, holes, *frames, how, space or how.space)
+        return {"warped": warped, "image": warped[..., :3]}
+
+    takes = ("target", "newest", "layers", "motion", "holes")
+    return Stage("guided warp", function, takes, ("warped", "image"), reads=(guides_of("newest"),))
 
 
 def guided() -> Method:
@@ -156,5 +175,5 @@ def guided() -> Method:
     References:
         Wu et al. 2023 (ExtraSS), section 4.2. Departure: `far_motion` before it, in frames of 360 rows or more.
     """
-    stages = (REPROJECT, HOLES, HINDSIGHT, demodulate_stage(), GUIDED, modulate_stage(), SKY)
+    stages = (REPROJECT, HOLES, HINDSIGHT, demodulate_stage(), guided_stage(), modulate_stage(), SKY)
     return Method("guided_warp", stages, past=2, settings=GuidedSettings())

@@ -1,0 +1,53 @@
+"""In which space colours are fetched between pixels: an option of every method that fetches any.
+
+A mean of a bright and a dark pixel is bright in linear light; after a tone curve it looks like what is between the two.
+"""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxtrapolate.methods.options import option
+from jaxtrapolate.ops.radiance import compress, expand
+from jaxtrapolate.precision import widest
+
+Space = Literal["linear", "log", "tone"]
+"""Linear light; its logarithm log(1 + x); or sqrt(x / (1 + x)), `compress`, near a display's tone curve."""
+
+
+def space() -> Any:
+    """The option."""
+    return option("linear", "in which colours are fetched between pixels", choices=Space)
+
+
+def in_space(
+    space: Space, fetch: Callable[[Array], Array], image: Float[Array, "h w c"], *, colors: int | None = None
+) -> Float[Array, "i j d"]:
+    """What `fetch` takes from an image, whose values it mixes in another space.
+
+    A pixel that is fetched unmixed from its own place is its value bit for bit. In another space than linear light
+    negative values count as 0, and no value exceeds the image's largest; what is not finite stays as in linear light.
+
+    Args:
+        space: see `Space`.
+        fetch: from an image to an image.
+        image: linear light `[H, W, C]`.
+        colors: how many of the last channels are colours, in the image and in what is fetched; `None` = all.
+    """
+    if space == "linear":
+        return fetch(image)
+    first = 0 if colors is None else image.shape[-1] - colors
+    color = jnp.asarray(image[..., first:])
+    wide = color.astype(widest(color))
+    known = jnp.isfinite(wide)
+    usual = jnp.where(known & (wide > 0), wide, 0)
+    encoded = jnp.where(known, compress(usual) if space == "tone" else jnp.log1p(usual), wide)
+    found = fetch(jnp.concatenate([image[..., :first].astype(encoded.dtype), encoded], -1) if first else encoded)
+    rest, answer = jnp.split(found, [found.shape[-1] - color.shape[-1]], -1)
+    decoded = jnp.minimum(expand(answer) if space == "tone" else jnp.expm1(answer), jnp.max(usual))
+    if answer.shape == encoded.shape:
+        decoded = jnp.where(answer == encoded, usual, decoded)
+    decoded = jnp.where(jnp.isfinite(answer), decoded, answer).astype(color.dtype)
+    return jnp.concatenate([rest.astype(color.dtype), decoded], -1)
