@@ -148,6 +148,7 @@ def dis_flow(
 
     Edge cases:
         Without texture the flow is 0. Pixels that are not finite are filled from around them first (`fill_pyramid`).
+        Grey levels are held to -1000..1000.
         Images repeat their edge. Images that are too small for a preset's size are searched at their own.
 
     Gradient:

@@ -168,6 +168,7 @@ def farneback_flow(
 
     Edge cases:
         Without texture the flow is 0. Pixels that are not finite are filled from around them first (`fill_pyramid`).
+        Grey levels are held to -1000..1000.
         Images repeat their edge. A pixel that the flow so far leads out of the frame speaks for that flow.
 
     Gradient:

@@ -20,6 +20,8 @@ from jaxtrapolate.ops.warp import all_finite, sample
 from jaxtrapolate.precision import widest
 
 _SCALE = 255.0  # of grey levels: constants of both flows are for images of 8 bits
+BRIGHTEST = 1000.0
+"""Images of which a flow is found are held to this: fourth powers of their levels are finite."""
 
 
 class Resampling(NamedTuple):
@@ -121,16 +123,18 @@ def resize(image: Float[Array, "h w"], size: Size, *, kind: str = "linear") -> F
 
 
 def gray_levels(image: Float[ArrayLike, "h w 1"]) -> Float[Array, "h w"]:
-    """0..255 where the image is 0..1, at least float32; what is not finite is filled from around it."""
+    """0..255 where the image is 0..1, at least float32; what is not finite is filled from around it.
+
+    The image is held to -1000..1000.
+    """
     image = jnp.asarray(image).astype(widest(image))
 
     def fill(image):
         return fill_pyramid(jnp.where(jnp.isfinite(image), image, 0), jnp.all(jnp.isfinite(image), -1))
 
     scaled = jax.lax.cond(all_finite(image), lambda i: i, fill, image)[..., 0] * _SCALE
-    largest = jnp.finfo(scaled.dtype).max
-    # also so that no product is fused into a difference of two images: equal ones would differ by its rounding
-    return jnp.clip(scaled, -largest, largest)
+    # held also so that no product is fused into a difference of two images: equal ones would differ by its rounding
+    return jnp.clip(scaled, -BRIGHTEST * _SCALE, BRIGHTEST * _SCALE)
 
 
 def fetch(image: Float[Array, "h w"], x: Float[Array, "i j"], y: Float[Array, "i j"]) -> Float[Array, "i j"]:

@@ -15,7 +15,7 @@ from jaxtrapolate.checks import ArrayLike, check_image
 from jaxtrapolate.ops.dis import Effort, Guidance, inverse_search_flow, level_sizes, like
 from jaxtrapolate.ops.fill import check_mask, fill_pyramid
 from jaxtrapolate.ops.refinement import Weights, shifted
-from jaxtrapolate.ops.resample import fetch, resize
+from jaxtrapolate.ops.resample import BRIGHTEST, fetch, resize
 from jaxtrapolate.ops.strips import once
 from jaxtrapolate.ops.warp import pixel_grid
 from jaxtrapolate.precision import divide, widest
@@ -106,8 +106,8 @@ def _shading_flow(
     guidance = Guidance(guides, sigma, valid.astype(wide))
 
     def gray(image):
-        mean = jnp.mean(jnp.where(valid[..., None], image, 0).astype(wide), -1, keepdims=True)
-        return fill_pyramid(mean, valid)[..., 0]
+        held = jnp.clip(jnp.where(valid[..., None], image, 0).astype(wide), -BRIGHTEST, BRIGHTEST)
+        return fill_pyramid(jnp.mean(held, -1, keepdims=True), valid)[..., 0]
 
     first, second = gray(newer), gray(older)
     effort = Effort(finest, _STRIDE, _STEPS, _REFINEMENTS)
@@ -182,8 +182,8 @@ def shading_flow(
         Equal images have no flow and no confidence, exactly.
 
     Edge cases:
-        Pixels that are not finite, in an image or in the guide, are holes. In holes both results are 0. Light that
-        appears, vanishes or blinks without moving is explained by no flow.
+        Pixels that are not finite, in an image or in the guide, are holes; light is held to -1000..1000. In holes both
+        results are 0. Light that appears, vanishes or blinks without moving is explained by no flow.
 
     Gradient:
         With respect to both images, the guide and the numbers; which steps the search takes, and where the flow
