@@ -429,6 +429,7 @@ def test_half_precision(x64, kind):
     np.testing.assert_allclose(np.float32(made.color), full, atol=2 * float(jnp.finfo(kind).eps))
 
 
+@pytest.mark.slow
 def test_jit_vmap_and_eager_agree():
     first = moving()
     second = tuple(jx.replace(f, color=f.color[::-1], depth=f.depth * 2) for f in first)
@@ -487,6 +488,7 @@ def test_gradients_against_differences(x64):
     oracles.assert_gradients(total, given, gradients, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_stay_finite():
     previous, next = layers()
     flow = np.array(previous.forward_flow)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from synthetic import texture
 
 import jaxtrapolate as jx
@@ -138,6 +139,7 @@ def test_no_texture_is_printed_on_what_shines():
     assert decibels("guided_net") > 35
 
 
+@pytest.mark.slow
 def test_one_changed_pixel_does_not_take_the_frame():
     """What stands still elsewhere is returned to the last bits."""
     frame = lit(0, step=0, size=(64, 96))[0]

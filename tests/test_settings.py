@@ -18,6 +18,7 @@ import pytest
 import small_extranet
 import synthetic
 import test_api
+from marks import slow
 from toy_task import ToyOptions, ToyTask
 
 import jaxtrapolate as jx
@@ -444,9 +445,9 @@ def draw():
     np.testing.assert_allclose(position[ground][:, 2], 0, atol=1e-4)
 
 
-def work(folder):
-    """What is done in two processes: an evaluation of a dump, and three steps of training."""
-    folder, found = Path(folder), {}
+def train(folder):
+    """Three steps of training."""
+    found = {}
     options, optimizer = ToyOptions(wobble=0.1), Optimizer(peak_learning_rate=0.03, warmup=2, clip=1.0)
     task = ToyTask(options)
     config = Config(task="toy", options=options, steps=3, batch=4, pool=8, ema_decay=0.9, optimizer=optimizer)
@@ -456,8 +457,12 @@ def work(folder):
         state, measured = step.take(state, pool)
     assert not {str(leaf.dtype) for leaf in jax.tree.leaves((state, measured, pool))} & {"float64", "int64"}
     found |= measured
-    np.savez(folder / "found.npz", **{name: np.asarray(value) for name, value in found.items()})
+    np.savez(Path(folder) / "found.npz", **{name: np.asarray(value) for name, value in found.items()})
 
+
+def evaluate(folder):
+    """An evaluation of a dump."""
+    folder = Path(folder)
     dump = folder / "dump"
     dump.mkdir()
     for k in range(4):
@@ -467,25 +472,27 @@ def work(folder):
     assert main(["evaluate", str(dump), "--methods", "repeat,warp", "--output", str(folder / "results")]) == 0
 
 
-@pytest.mark.parametrize(
-    "before", ["", pytest.param("test_settings.draw(); ", marks=pytest.mark.slow)], ids=["", "draw"]
-)
-def test_a_process_with_all_settings(tmp_path, before):
+@pytest.mark.parametrize("steps", ["evaluate", *slow("train, evaluate", "draw, train, evaluate")])
+def test_a_process_with_all_settings(tmp_path, steps):
     """By environment variables, as users set them; against a process without."""
     there, here = tmp_path / "there", tmp_path / "here"
     there.mkdir()
     here.mkdir()
-    code = f"import test_settings; {before}test_settings.work({str(there)!r})"
+    calls = {"evaluate": "evaluate({})", "train": "train({})", "draw": "draw()"}
+    code = "; ".join(f"test_settings.{calls[step].format(repr(str(there)))}" for step in steps.split(", "))
     folders = os.pathsep.join([str(TESTS), str(Path(jx.__file__).parents[1])])
     environment = os.environ | VARIABLES | {"PYTHONPATH": folders}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=tmp_path)
+    command = [sys.executable, "-c", f"import test_settings; {code}"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
-    work(here)
-    ours, theirs = (np.load(folder / "found.npz") for folder in (here, there))
-    assert set(ours) == set(theirs)
-    for name in ours:
-        assert ours[name].dtype == theirs[name].dtype == np.float32
-        np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-4, err_msg=name)
+    evaluate(here)
+    if "train" in steps:
+        train(here)
+        ours, theirs = (np.load(folder / "found.npz") for folder in (here, there))
+        assert set(ours) == set(theirs)
+        for name in ours:
+            assert ours[name].dtype == theirs[name].dtype == np.float32
+            np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-4, err_msg=name)
     scores = [json.loads((folder / "results" / "results.json").read_text())["methods"] for folder in (here, there)]
     assert scores[0].keys() == scores[1].keys() == {"repeat", "warp"}
     for name, score in scores[0].items():

@@ -83,6 +83,7 @@ def box(image, light):
     return image
 
 
+@pytest.mark.slow
 def test_a_silhouette_stays():
     """The shadow passes behind a box: the guide keeps its motion off the box, bit for bit."""
     newer, older = (box(image, 0.5) for image in pair())
@@ -146,7 +147,7 @@ def test_other_resolutions(finest):
 
 
 @pytest.mark.parametrize(
-    "size", [(1, 1), (5, 7), *(pytest.param(s, marks=pytest.mark.slow) for s in ((1, 7), (6, 1), (33, 17)))]
+    "size", [(1, 1), *(pytest.param(s, marks=pytest.mark.slow) for s in ((5, 7), (1, 7), (6, 1), (33, 17)))]
 )
 def test_every_size(size):
     rng = np.random.default_rng(0)
