@@ -214,6 +214,15 @@ def reach() -> str:
     return table(["", *sizes], rows)
 
 
+def spaces() -> str:
+    """In which space colours are fetched, mean dB."""
+    rows = []
+    for name, scenes in read("experiments/results/space.json")["methods"].items():
+        means = {space: fmean(row[space] for row in scenes.values()) for space in ("linear", "log", "tone")}
+        rows.append([name, *(f"{mean:.2f}" for mean in means.values())])
+    return table(["", *("linear", "log", "tone")], rows)
+
+
 _PARTS = {
     "warp": "warp",
     "occlusion_warp": "occlusion_warp",
@@ -410,6 +419,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "networks": networks,
     "scenes": scenes,
     "reach": reach,
+    "spaces": spaces,
     "ablations": ablations,
     "failures": failures,
     "curve": curve,
