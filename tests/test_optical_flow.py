@@ -168,7 +168,8 @@ CHEAP = {
 }
 
 
-@pytest.mark.parametrize("name", ["farneback", *slow("dis")])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FLOWS)
 def test_gradients_are_those_of_differences(x64, name):
     """In float64, against central differences along three directions, forward and reverse."""
     first, second = texture((18, 21), seed=2), texture((18, 21), seed=3)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import slow_rows
 from synthetic import make_frame
 
 import jaxtrapolate as jx
@@ -295,7 +296,7 @@ def test_a_stage_runs_where_it_is_needed():
         assert len(runs) == motion
 
 
-@pytest.mark.parametrize("name, stage", [("occlusion_warp", "occlusion motion"), ("guided_net", "network")])
+@pytest.mark.parametrize("name, stage", [("occlusion_warp", "occlusion motion"), *slow_rows(("guided_net", "network"))])
 def test_what_is_spared_gives_the_same(name, stage):
     """Without the test the image is the same: in frames that stand still, and in frames that do not."""
     method = jx.load(name)
