@@ -22,9 +22,7 @@ def space() -> Any:
     return option("linear", "in which colours are fetched between pixels", choices=Space)
 
 
-def in_space(
-    space: Space, fetch: Callable[[Array], Array], image: Float[Array, "h w c"], *, colors: int | None = None
-) -> Float[Array, "i j d"]:
+def in_space(space: Space, fetch: Callable[[Array], Array], image: Float[Array, "h w c"]) -> Float[Array, "i j d"]:
     """What `fetch` takes from an image, whose values it mixes in another space.
 
     A pixel that is fetched unmixed from its own place is its value bit for bit. In another space than linear light
@@ -32,19 +30,17 @@ def in_space(
 
     Args:
         space: see `Space`.
-        fetch: from an image to an image.
+        fetch: from an image to an image, whose last channels are the colours.
         image: linear light `[H, W, C]`.
-        colors: how many of the last channels are colours, in the image and in what is fetched; `None` = all.
     """
     if space == "linear":
         return fetch(image)
-    first = 0 if colors is None else image.shape[-1] - colors
-    color = jnp.asarray(image[..., first:])
+    color = jnp.asarray(image)
     wide = color.astype(widest(color))
     known = jnp.isfinite(wide)
     usual = jnp.where(known & (wide > 0), wide, 0)
     encoded = jnp.where(known, compress(usual) if space == "tone" else jnp.log1p(usual), wide)
-    found = fetch(jnp.concatenate([image[..., :first].astype(encoded.dtype), encoded], -1) if first else encoded)
+    found = fetch(encoded)
     rest, answer = jnp.split(found, [found.shape[-1] - color.shape[-1]], -1)
     decoded = jnp.minimum(expand(answer) if space == "tone" else jnp.expm1(answer), jnp.max(usual))
     if answer.shape == encoded.shape:
