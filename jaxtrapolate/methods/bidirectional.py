@@ -23,7 +23,7 @@ from jaxtrapolate.methods.frames import rendered, upcoming
 from jaxtrapolate.methods.hindsight import block_sums, from_blocks
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
-from jaxtrapolate.methods.space import Space, in_space, space
+from jaxtrapolate.methods.space import in_space
 from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.methods.stages import SKY, Demodulation, chain, find_holes, reflecting
 from jaxtrapolate.methods.warping import GuidedSettings, fetch_guided, guides_of
@@ -58,8 +58,6 @@ class SearchSettings:
 @settings
 class AssistedSettings(SearchSettings, Demodulation):
     """Of demodulation, of the fetch, and of the search where nothing was drawn of the target."""
-
-    space: Space = space()
 
 
 def depth_kind(*frames: Frame) -> DepthKind:

@@ -288,7 +288,10 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
     def sky(state, values: Values):
         image = values["image"]
         # the guided warp finds like sky where the occluder has moved on; the sky is not divided by anything
-        plain = values["guess"] if guided and preparation.sky else composite(values, values["newest"].color)
+        if guided and preparation.sky:
+            plain = values["guess"]
+        else:
+            plain = in_space(preparation.space, partial(composite, values), values["newest"].color)
         return {"image": jnp.where(values["target"].gbuffer.sky > 0.5, plain.astype(image.dtype), image)}
 
     past = max(1, config.histories)

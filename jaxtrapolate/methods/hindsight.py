@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.frames import rendered
+from jaxtrapolate.methods.space import Space, in_space
 from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.methods.stages import chain, reflecting
 from jaxtrapolate.ops.radiance import By, compress, demodulate, modulate
@@ -55,7 +56,7 @@ def from_blocks(values: Float[Array, "i j 1"], x: Array, y: Array) -> Float[Arra
     return sample(values, (x + 0.5) / _BLOCK - 0.5, (y + 0.5) / _BLOCK - 0.5)
 
 
-@partial(jax.jit, static_argnames=("by",))
+@partial(jax.jit, static_argnames=("by", "space"))
 def plain_share(
     newest: Frame,
     previous: Frame,
@@ -64,6 +65,7 @@ def plain_share(
     by: By,
     floor: float | Float[Array, ""] = 1e-2,
     margin: float | Float[Array, ""] = 2.0,
+    space: Space = "linear",
 ) -> Float[Array, "i j 1"]:
     """How much of a prediction should come from the undivided colour, 0..1, for each block of 8 x 8 pixels of `newest`.
 
@@ -80,12 +82,13 @@ def plain_share(
         by: as of `demodulate`.
         floor: as of `demodulate`.
         margin: at least 0.
+        space: in which colours are fetched, as the method that asks does.
     """
     truth = check_present("newest.color", newest.color, needed_by="plain_share")
     truth = compress(truth.astype(widest(truth)))
     color = check_present("previous.color", previous.color, needed_by="plain_share")
-    plain = backward_warp(color, motion)
-    divided = backward_warp(demodulate(color, previous.gbuffer, by=by, floor=floor), motion)
+    fetch = partial(in_space, space, partial(backward_warp, motion=motion))
+    plain, divided = fetch(color), fetch(demodulate(color, previous.gbuffer, by=by, floor=floor))
 
     def error(image):
         difference = jnp.square(compress(image.astype(truth.dtype)) - truth)
@@ -99,7 +102,7 @@ def hindsight_stage(how: Any = None) -> Stage:
     """Adds "plain_share", carried along the motion to the target's grid; `margin` is an option of the method.
 
     Args:
-        how: has by, floor and sky, as of `demodulate_stage`.
+        how: has by, floor, sky and space, as of `demodulate_stage`.
     """
 
     def function(state, values: Values):
@@ -107,7 +110,8 @@ def hindsight_stage(how: Any = None) -> Stage:
         newest, previous = rendered(history)[:2]
         frames = (replace(history[i], gbuffer=reflecting(history[i].gbuffer, given.sky)) for i in (newest, previous))
         between = chain(history, newest, previous)
-        found = plain_share(*frames, between, by=given.by, floor=given.floor, margin=state.settings.margin)
+        options = {"by": given.by, "floor": given.floor, "margin": state.settings.margin, "space": given.space}
+        found = plain_share(*frames, between, **options)
         x, y, _ = landing(values["motion"])
         return {"plain_share": from_blocks(found, x, y)}
 

@@ -46,8 +46,7 @@ def dis() -> Method:
     alpha (1 - alpha) B.
 
     References: Kroeger et al. 2016 for the flow, Jiang et al. 2018 (Super SloMo), equation 4, for that of the target.
-    Departures: no occlusion is reasoned about; colours are fetched as linear radiance unless said, where a video player
-    fetches display values.
+    Departures: no occlusion is reasoned about; colours are fetched after a curve near the display's, unless said.
     """
 
     def flow(state, values: Values):

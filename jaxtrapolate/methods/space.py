@@ -17,16 +17,17 @@ Space = Literal["linear", "log", "tone"]
 """Linear light; its logarithm log(1 + x); or sqrt(x / (1 + x)), `compress`, near a display's tone curve."""
 
 
-def space() -> Any:
-    """The option."""
-    return option("linear", "in which colours are fetched between pixels", choices=Space)
+def space(default: Space = "tone") -> Any:
+    """The option; its default is measured in experiments/space.py."""
+    return option(default, "in which colours are fetched between pixels", choices=Space)
 
 
 def in_space(space: Space, fetch: Callable[[Array], Array], image: Float[Array, "h w c"]) -> Float[Array, "i j d"]:
     """What `fetch` takes from an image, whose values it mixes in another space.
 
     A pixel that is fetched unmixed from its own place is its value bit for bit. In another space than linear light
-    negative values count as 0, and no value exceeds the image's largest; what is not finite stays as in linear light.
+    negative values are mixed as mirrored ones, and no magnitude exceeds the image's largest; what is not finite stays
+    as in linear light.
 
     Args:
         space: see `Space`.
@@ -38,12 +39,13 @@ def in_space(space: Space, fetch: Callable[[Array], Array], image: Float[Array, 
     color = jnp.asarray(image)
     wide = color.astype(widest(color))
     known = jnp.isfinite(wide)
-    usual = jnp.where(known & (wide > 0), wide, 0)
-    encoded = jnp.where(known, compress(usual) if space == "tone" else jnp.log1p(usual), wide)
+    usual = jnp.where(known, jnp.abs(wide), 0)
+    curve, inverse = (compress, expand) if space == "tone" else (jnp.log1p, jnp.expm1)
+    encoded = jnp.where(known, jnp.sign(wide) * curve(usual), wide)
     found = fetch(encoded)
     rest, answer = jnp.split(found, [found.shape[-1] - color.shape[-1]], -1)
-    decoded = jnp.minimum(expand(answer) if space == "tone" else jnp.expm1(answer), jnp.max(usual))
+    decoded = jnp.sign(answer) * jnp.minimum(inverse(jnp.abs(answer)), jnp.max(usual))
     if answer.shape == encoded.shape:
-        decoded = jnp.where(answer == encoded, usual, decoded)
+        decoded = jnp.where(answer == encoded, wide, decoded)
     decoded = jnp.where(jnp.isfinite(answer), decoded, answer).astype(color.dtype)
     return jnp.concatenate([rest.astype(color.dtype), decoded], -1)

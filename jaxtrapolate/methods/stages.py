@@ -9,6 +9,7 @@ can be the demodulated colour, followed by the undivided one where "plain_share"
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Literal
 
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from jaxtrapolate.bidirectional.assisted import blend
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.space import Space, in_space, space
 from jaxtrapolate.methods.stage import Needed, Stage, Values
 from jaxtrapolate.ops.holes import Taps, hole_masks
 from jaxtrapolate.ops.motion import chain_motion, occlusion_motion
@@ -33,12 +35,13 @@ def margin() -> Any:
 
 @settings
 class Demodulation:
-    """How colours are divided by the reflectance."""
+    """How colours are divided by the reflectance, and fetched."""
 
     by: By = option("albedo+specular", "what the colour is divided by before it is warped", choices=By)
     floor: float = option(0.01, "the smallest divisor", low=0, high=1)
     sky: bool = option(True, "whether the sky's colour is warped undivided; else its albedo counts")
     margin: float = margin()
+    space: Space = space()
 
 
 def chain(frames: Sequence[Frame], first: int, last: int, *, before: Array | None = None) -> Array:
@@ -100,7 +103,7 @@ def demodulate_stage(how: Any = None) -> Stage:
     """Divides the sources by their reflectance; without albedo the colour is warped undivided.
 
     Args:
-        how: has by, floor and sky, as `Demodulation`; `None` = the method's options.
+        how: has by, floor, sky and space, as `Demodulation`; `None` = the method's options.
     """
 
     def function(state, values: Values):
@@ -130,7 +133,7 @@ def modulate_stage(how: Any = None) -> Stage:
         share = values["plain_share"]
         if share is not None:
             own = values["warped"][..., 3:]
-            exact = backward_warp(values["newest"].color, values["motion"])
+            exact = in_space(given.space, partial(backward_warp, motion=values["motion"]), values["newest"].color)
             plain = jnp.where(values["holes"] | (share < 1), own, exact)
             image = blend(image, plain, share)
         return {"image": image}

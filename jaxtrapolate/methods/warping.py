@@ -43,7 +43,7 @@ class WarpSettings:
     """How a frame is fetched."""
 
     filter: Filter = option("bilinear", "how colours are interpolated between pixels", choices=Filter)
-    space: Space = space()
+    space: Space = space("linear")  # the baseline that it is
 
 
 def warp() -> Method:
@@ -57,13 +57,6 @@ def warp() -> Method:
     return Method(
         "warp", (REPROJECT, Stage("warp", function, ("newest", "motion"), ("image",)), SKY), settings=WarpSettings()
     )
-
-
-@settings
-class OcclusionSettings(Demodulation):
-    """Of demodulation and of the warp."""
-
-    space: Space = space()
 
 
 def occlusion_warp() -> Method:
@@ -83,7 +76,7 @@ def occlusion_warp() -> Method:
         modulate_stage(),
         SKY,
     )
-    return Method("occlusion_warp", stages, past=2, settings=OcclusionSettings())
+    return Method("occlusion_warp", stages, past=2, settings=Demodulation())
 
 
 _GUIDES = ("albedo", "normal")
@@ -108,8 +101,6 @@ class Guide:
 @settings
 class GuidedSettings(Guide, Demodulation):
     """Of demodulation and of the guided warp."""
-
-    space: Space = space()
 
 
 def guides(target, source, motion):
