@@ -102,9 +102,13 @@ def operations():
 
     def masks(taps, softness=0.0):
         def function(d, e, f, b):
-            position = jnp.concatenate([jnp.asarray(np.stack([x, y], -1), jnp.float32), jnp.minimum(d, 5)], -1)
-            buffers = [GBuffer(depth=a, position=jnp.where(jnp.isfinite(position), position, 7)) for a in (e, d)]
-            return jax.tree.leaves(jx.hole_masks(*buffers, b[..., :2] + 0.1, taps=taps, softness=softness))
+            def buffers(depth):  # a position is its own frame's, and anything where nothing is
+                position = jnp.concatenate([jnp.asarray(np.stack([x, y], -1), jnp.float32), jnp.minimum(depth, 5)], -1)
+                return GBuffer(depth=depth, position=jnp.where(jnp.isfinite(position), position, 7))
+
+            return jax.tree.leaves(
+                jx.hole_masks(buffers(e), buffers(d), b[..., :2] + 0.1, taps=taps, softness=softness)
+            )
 
         return function
 
