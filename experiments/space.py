@@ -49,19 +49,20 @@ def main() -> None:
     result: dict = {"seeds": [int(TRAINING_SEEDS[k]) for k in SEEDS], "frames": options.frames, "methods": {}}
     if options.output.exists():  # methods that were measured before stay
         result["methods"] = json.loads(options.output.read_text())["methods"]
-    for name in options.methods.split(","):
-        spaces = {space: jx.load(name, space=space) for space in get_args(Space)}
-        by_scene: dict[str, dict[str, float]] = {}
-        for scene in options.scenes.split(","):
-            found: dict[str, list[float]] = {space: [] for space in spaces}
-            for seed in SEEDS:
-                sequence = SceneSequence(scene, TRAINING_SEEDS[seed], frames=options.frames, size=(180, 320))
-                results = jx.evaluate(sequence, spaces, metrics=())
-                for space, method in results.methods.items():
-                    found[space] += [frame.psnr for frame in method.frames]
-            by_scene[scene] = {space: float(np.mean(values)) for space, values in found.items()}
-            print(name, scene, {space: round(value, 2) for space, value in by_scene[scene].items()}, flush=True)
-        result["methods"][name] = by_scene
+    names, spaces = options.methods.split(","), get_args(Space)
+    methods = {f"{name}:{space}": jx.load(name, space=space) for name in names for space in spaces}
+    for name in names:
+        result["methods"][name] = {}
+    for scene in options.scenes.split(","):
+        found: dict[str, list[float]] = {key: [] for key in methods}
+        for seed in SEEDS:
+            sequence = SceneSequence(scene, TRAINING_SEEDS[seed], frames=options.frames, size=(180, 320))
+            for key, method in jx.evaluate(sequence, methods, metrics=()).methods.items():
+                found[key] += [frame.psnr for frame in method.frames]
+        for name in names:
+            means = {space: float(np.mean(found[f"{name}:{space}"])) for space in spaces}
+            result["methods"][name][scene] = means
+            print(name, scene, {space: round(value, 2) for space, value in means.items()}, flush=True)
         with atomic_path(options.output) as path:
             path.write_text(json.dumps(result, indent=1) + "\n")
     table = Table("", *get_args(Space), title="mean dB")

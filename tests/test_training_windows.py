@@ -75,7 +75,7 @@ def test_no_seed_is_of_two_kinds(cheap):
     assert len({seed for _, seed in cheap}) == 300
     assert {name for name, _ in cheap} == set(module.MOVING)
     cheap.clear()
-    windows.pool(jax.random.key(0), range(50), validation=True)
+    assert len(list(windows.held(50))) == 50
     assert {seed in VALIDATION_SEEDS for _, seed in cheap} == {True}
 
 
@@ -165,9 +165,9 @@ def test_windows_of_dumps(dump, together):
     windows, seen = Windows(options, everything, past=3), {True: set(), False: set()}
     frame = open_sequence(dump).frame
     for validation, numbers in seen.items():
-        made = windows.pool(jax.random.key(0), range(8), validation=validation)["window"]
-        for i in range(8):
-            window = jax.tree.map(lambda a, i=i: a[i], made)
+        made = windows.pool(jax.random.key(0), range(8))["window"]
+        single = [jax.tree.map(lambda a, i=i: a[i], made) for i in range(8)]
+        for window in list(windows.held(7)) if validation else single:
             number = int(window.number)
             frames = [frame(k) if (number - k) % 2 else hide(frame(k)) for k in range(number - 5, number + 1)]
             expected = Window(number, frame(number), tuple(frames[:-1]), frames[-1], ())
@@ -347,7 +347,8 @@ class RefineTask:
         return jnp.mean(jnp.abs(model(batch["x"]) - batch["y"])), {}
 
     def validate(self, model):
-        pool = self.windows.pool(jax.random.key(1), range(8), validation=True)
+        held = [self.prepare(jax.tree.map(jnp.asarray, window), None) for window in self.windows.held(8)]
+        pool = jax.tree.map(lambda *leaves: jnp.stack(leaves), *held)
         made, warped, true, holes = model(pool["x"]), pool["x"][..., :3], pool["y"], pool["x"][..., 3:4]
         error, ghosts = (float(jnp.sum(holes * jnp.abs(v - true)) / jnp.sum(holes) / 3) for v in (made, warped))
         scores = {"gain": ghosts / error, "error": error, "ghosts": ghosts}

@@ -326,6 +326,19 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
     return Method(name, stages, past=past, weights=weights, settings=given, networks={"network": function})
 
 
+def first_guess(method: Method) -> Method:
+    """The same method with what its network corrects as the answer: what a network has to be better than."""
+
+    def guess(state, values: Values):
+        image = values["warped"][..., :3]
+        kept = {name: values[name] for name in ("warped", "plain_share")}
+        return {"image": image, "guess": image, **kept}
+
+    stages = {stage.name: stage for stage in method.stages}
+    stages["network"] = dataclasses.replace(stages["network"], function=guess, needed=None)
+    return dataclasses.replace(method, stages=tuple(stages.values()))
+
+
 def read_network(path: str | PathLike[str], name: str) -> tuple[ExtraNet, Preparation]:
     """A network and its preparation, from a file of this library or an Orbax checkpoint.
 

@@ -151,8 +151,16 @@ class Method:
         Raises:
             ValueError: an unknown option, or a value of another kind or out of range; lists the options.
         """
-        changed = dataclasses.replace(self, settings=replaced(f"method {self.name!r}", self.settings, options))
-        for name in ("_jitted", "_first_values", "_compiled_rows", "jitted_stages"):  # none of them holds the settings
+        return self._changed(settings=replaced(f"method {self.name!r}", self.settings, options))
+
+    def with_weights(self, weights: Any) -> "Method":
+        """This method with other weights of the same structure and shapes, without compiling anew."""
+        return self._changed(weights=weights)
+
+    def _changed(self, **fields: Any) -> "Method":
+        """With other fields that `state` holds: what is compiled does not hold them."""
+        changed = dataclasses.replace(self, **fields)
+        for name in ("_jitted", "_first_values", "_compiled_rows", "jitted_stages"):
             changed.__dict__[name] = getattr(self, name)
         return changed
 

@@ -12,16 +12,17 @@ from jaxtyping import Array, PRNGKeyArray
 
 from jaxtrapolate.checks import Size, check_present
 from jaxtrapolate.evaluation.windows import Window
-from jaxtrapolate.methods.extranet import NAME, Preparation, encoded_truth, extranet, extranet_config
+from jaxtrapolate.methods.extranet import NAME, Preparation, encoded_truth, extranet, extranet_config, first_guess
 from jaxtrapolate.methods.stages import reflecting
-from jaxtrapolate.metrics import psnr
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
-from jaxtrapolate.ops.radiance import demodulation_divisor, log_decode, tonemap
+from jaxtrapolate.networks.inference import inference
+from jaxtrapolate.ops.radiance import demodulation_divisor
 from jaxtrapolate.training.augment import crop
 from jaxtrapolate.training.config import check_range
 from jaxtrapolate.training.losses import extranet_loss, relative_loss
 from jaxtrapolate.training.tasks import Batch, Example
-from jaxtrapolate.training.windows import WindowOptions, Windows, check_crop, validated
+from jaxtrapolate.training.validation import Validation, lean
+from jaxtrapolate.training.windows import WindowOptions, Windows, check_crop
 
 _BRIGHTEST = 16.0  # in the log domain; above it nothing is told apart
 _DARKEST = 1e-3
@@ -92,7 +93,7 @@ class ExtraNetTask:
         self._windows = Windows(options.windows, self._prepare, past=self._stages.past)
         self._windows.check_sizes()
         self.sequences = self._windows.sequences
-        self._held: Example | None = None
+        self._validation: Validation | None = None
         config = extranet_config(options.network, options.preparation)
         scenes = ", ".join(options.windows.scenes)
         self.about: Mapping[str, Any] = {"method": method, "config": config, "note": f"trained on {scenes}"}
@@ -162,10 +163,11 @@ class ExtraNetTask:
         return jnp.mean(total), {name: jnp.mean(part) for name, part in parts.items()}
 
     def validate(self, model: nnx.Module) -> tuple[Mapping[str, float], Mapping[str, Any]]:
-        """dB of whole validation windows, tone mapped: "psnr", in holes "psnr_hole"; "gain" over the first guess."""
-        if self._held is None:
-            self._held = self._windows.pool(jax.random.key(0), range(self.options.validation), validation=True)
-        scores, images = validated(lambda one: _scored(model, one), self._held)
+        """dB of the method's frames: "psnr", in holes "psnr_hole"; "guess" without the network, "gain" over that."""
+        if self._validation is None:
+            windows = list(map(lean, self._windows.held(self.options.validation)))
+            self._validation = Validation(windows, "guess", first_guess(self._stages), holes=True)
+        scores, images = self._validation(self._stages.with_weights(inference(model)[1]))
         return {"gain": scores["psnr"] - scores["guess"], **scores}, images
 
 
@@ -191,22 +193,3 @@ def _display(light: Array, divisor: Array) -> Array:
     lit = image > 0
     mapped = jnp.sqrt(1 - 1 / (1 + _DARKEST + jnp.where(lit, image, 0)))
     return jnp.where(known, jnp.where(lit, mapped, mapped + image * (0.5 / _DARKEST**0.5)), jnp.nan)
-
-
-@nnx.jit
-def _scored(model: Any, one: Batch) -> tuple[dict[str, Array], Array]:
-    """The scores of one window, and the ground truth, the prediction and the difference side by side."""
-    truth, divisor, hole = one["target"][0], one["divisor"][0], one["mask"][0] < 0.5
-    known = jnp.isfinite(truth[..., :1])
-    images = {"psnr": _predict(model, one)[0], "guess": one["x"][0, ..., :3]}
-    if one["x"].shape[-1] == 6:
-        images["composite"] = one["x"][0, ..., 3:]
-    truth, *predicted = (
-        tonemap(jnp.where(known, log_decode(jnp.where(known, light, 0)) * divisor, 0))
-        for light in (truth, *images.values())
-    )
-    scores = {}
-    for name, image in zip(images, predicted, strict=True):
-        scores[name] = psnr(image, truth, mask=known)
-        scores[f"{name}_hole"] = psnr(image, truth, mask=known & hole)
-    return scores, jnp.concatenate([truth, predicted[0], jnp.minimum(4 * jnp.abs(predicted[0] - truth), 1)], 1)

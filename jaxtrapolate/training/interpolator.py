@@ -11,15 +11,17 @@ from jaxtyping import Array, PRNGKeyArray
 
 from jaxtrapolate.checks import Size, check_present
 from jaxtrapolate.evaluation.windows import Window
+from jaxtrapolate.methods.blending import blend
 from jaxtrapolate.methods.interpolator import interpolator, interpolator_config
-from jaxtrapolate.metrics import psnr
+from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.networks.interpolator import Interpolator, InterpolatorConfig
-from jaxtrapolate.ops.radiance import compress, expand, tonemap
+from jaxtrapolate.ops.radiance import compress
 from jaxtrapolate.training.augment import crop
 from jaxtrapolate.training.config import check_range
 from jaxtrapolate.training.losses import charbonnier_loss
 from jaxtrapolate.training.tasks import Batch, Example
-from jaxtrapolate.training.windows import WindowOptions, Windows, check_crop, validated
+from jaxtrapolate.training.validation import Validation, lean
+from jaxtrapolate.training.windows import WindowOptions, Windows, check_crop
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +65,7 @@ class InterpolatorTask:
         self._windows = Windows(options.windows, self._prepare, past=1, future=1)
         self._windows.check_sizes()
         self.sequences = self._windows.sequences
-        self._held: Example | None = None
+        self._validation: Validation | None = None
         scenes = ", ".join(options.windows.scenes)
         config = interpolator_config(options.network)
         self.about: Mapping[str, Any] = {"method": "interpolator", "config": config, "note": f"trained on {scenes}"}
@@ -101,21 +103,13 @@ class InterpolatorTask:
         ), {}
 
     def validate(self, model: nnx.Module) -> tuple[Mapping[str, float], Mapping[str, Any]]:
-        """dB of whole validation windows, tone mapped: "psnr"; "blend", of the mean of the two frames."""
-        if self._held is None:
-            self._held = self._windows.pool(jax.random.key(0), range(self.options.validation), validation=True)
-        return validated(lambda one: _scored(model, one), self._held)
+        """dB of the method's frames: "psnr"; "blend", of both rendered frames mixed."""
+        if self._validation is None:
+            windows = list(map(lean, self._windows.held(self.options.validation)))
+            self._validation = Validation(windows, "blend", blend())
+        return self._validation(self._stages.with_weights(inference(model)[1]))
 
 
 def _predict(model: Any, batch: Batch) -> Array:
     first = batch["first"]
     return model(first, batch["second"], jnp.full(first.shape[0], 0.5, first.dtype))
-
-
-@nnx.jit
-def _scored(model: Any, one: Batch) -> tuple[dict[str, Array], Array]:
-    """The scores of one window, and the ground truth, the prediction and the difference side by side."""
-    blend = (one["first"] + one["second"]) / 2
-    truth, predicted, mean = (tonemap(expand(image[0])) for image in (one["target"], _predict(model, one), blend))
-    scores = {"psnr": psnr(predicted, truth), "blend": psnr(mean, truth)}
-    return scores, jnp.concatenate([truth, predicted, jnp.minimum(4 * jnp.abs(predicted - truth), 1)], 1)

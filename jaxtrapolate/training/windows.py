@@ -7,7 +7,7 @@ for each example of a pool and at full frame; batches are cut from what that giv
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
 import jax
@@ -37,8 +37,6 @@ SEEDS = TRAINING_SEEDS[: -(2**20)]
 
 MOVING = tuple(name for name in scene_names() if name != "still")
 """The scenes in which something moves."""
-
-_SHOWN = 4  # validation windows whose images are kept
 
 Prepare = Callable[[Window, PRNGKeyArray], Example]
 """What a task derives from a window, once: pure and traced; for windows of several sizes cut to one."""
@@ -205,28 +203,6 @@ def check_crop(crop: Size, size: Size) -> None:
         raise ValueError(f"crop: expected at most windows.size = {list(size)}, got {list(crop)}")
 
 
-def validated(
-    score: Callable[[Example], tuple[Mapping[str, Array], Array]], held: Example
-) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-    """The scores of validation windows, each the mean of those that are finite, and the images of the first few.
-
-    Args:
-        score: of a batch of one window: scalars by name, and an image.
-        held: the windows, stacked along a leading axis.
-    """
-    rows, images = [], {}
-    for i in range(len(jax.tree.leaves(held)[0])):
-        row, shown = score(jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], held))
-        rows.append({name: float(value) for name, value in row.items()})
-        if i < _SHOWN:
-            images[f"window{i}"] = np.asarray(shown)
-    scores = {}
-    for name in rows[0]:
-        known = [row[name] for row in rows if np.isfinite(row[name])]
-        scores[name] = float(np.mean(known)) if known else float("nan")
-    return scores, images
-
-
 def _parted(numbers: list[int]) -> tuple[list[int], list[int]]:
     """Numbers for training and for validation, the last tenth; a single one is for both."""
     held = -(-len(numbers) // 10) if len(numbers) > 1 else 0
@@ -252,6 +228,7 @@ class Windows:
         draw = functools.partial(scene_window, size=options.size, past=past, future=future, motion=options.motion)
         self._render = _mapped(draw, options.together)
         self._prepare = _mapped(lambda w, h, v, key: prepare(flip(w, horizontal=h, vertical=v), key), options.together)
+        self._flip = _mapped(lambda w, h, v: flip(w, horizontal=h, vertical=v), options.together)
 
     @property
     def sequences(self) -> tuple[Sequence, ...]:
@@ -276,10 +253,8 @@ class Windows:
             raise InputError(f"{sequence.name}: has no {before + 1 + behind} frames in a row for a window")
         return numbers
 
-    def pool(self, key: PRNGKeyArray, numbers: range, *, validation: bool = False) -> Example:
+    def pool(self, key: PRNGKeyArray, numbers: range) -> Example:
         """The prepared windows `numbers` of the pool that a key stands for, stacked along a leading axis.
-
-        validation: of scenes by `VALIDATION_SEEDS` instead of `SEEDS`, of dumps' last tenth.
 
         Raises:
             ValueError: `prepare` gives arrays of several shapes.
@@ -287,19 +262,34 @@ class Windows:
         words = np.asarray(jax.random.key_data(key)).tolist()
         together = self.options.together
         first, last = numbers.start // together, -(-numbers.stop // together)
-        blocks = [self._block(key, words, number, validation) for number in range(first, last)]
+        blocks = []
+        for number in range(first, last):
+            name, windows, flips = self._block(words, number, validation=False)
+            keys = jax.random.split(jax.random.fold_in(key, number), together)
+            try:
+                blocks.append(self._prepare(windows, *flips, keys))
+            except ValueError as error:
+                raise InputError(f"windows of {name}: {error}") from error
         shapes = {str(jax.tree.map(lambda a: a.shape[1:], block)) for block in blocks}
         if len(shapes) > 1:
             raise ValueError(f"prepare: expected arrays of the same shapes of every window, got {' and '.join(shapes)}")
         skipped = numbers.start - first * together
         return jax.tree.map(lambda *a: jnp.concatenate(a)[skipped : skipped + len(numbers)], *blocks)
 
-    def _block(self, key: PRNGKeyArray, words: list[int], number: int, validation: bool) -> Example:
-        """The windows of one scene or dump that are prepared together."""
+    def held(self, count: int) -> Iterator[Window]:
+        """The first windows for validation, one by one: of scenes by `VALIDATION_SEEDS`, of dumps' last tenth."""
+        words = np.asarray(jax.random.key_data(jax.random.key(0))).tolist()
+        for number in range(-(-count // self.options.together)):
+            _, windows, flips = self._block(words, number, validation=True)
+            windows = self._flip(windows, *flips)
+            for k in range(min(self.options.together, count - number * self.options.together)):
+                yield jax.tree.map(lambda leaf, k=k: leaf[k], windows)
+
+    def _block(self, words: list[int], number: int, *, validation: bool) -> tuple[str, Window, np.ndarray]:
+        """The windows of one scene or dump that are prepared together, and how each is flipped."""
         options, count = self.options, self.options.together
         rng = np.random.default_rng([*words, number])
         flips = rng.random((2, count)) < np.array(options.flip)[:, None]
-        keys = jax.random.split(jax.random.fold_in(key, number), count)
         if self._dumps and rng.random() < options.dumps_share:
             name, windows = self._read(rng, count, validation)
         else:
@@ -310,10 +300,7 @@ class Windows:
             windows = _without(windows, _KINDS[rng.integers(len(_KINDS))])
         if options.lamps and rng.random() < options.lamps:
             windows = brighten(windows, rng.uniform(0, _POWER))
-        try:
-            return self._prepare(windows, *flips, keys)
-        except ValueError as error:
-            raise InputError(f"windows of {name}: {error}") from error
+        return name, windows, flips
 
     def _draw(self, rng: np.random.Generator, count: int, seeds: range) -> tuple[str, Window]:
         options = self.options
