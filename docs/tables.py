@@ -6,64 +6,22 @@ python docs/tables.py --check   # exit status 1 where a page differs
 
 import argparse
 import difflib
-import json
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-ROOT = Path(__file__).parents[1]
+import scores
+from tabulate import ROOT, milliseconds, read, table
+
 PAGES = (
     "README.md",
     *(f"docs/{name}.md" for name in ("results", "speed", "scenes", "extreme")),
     "experiments/README.md",
 )
 BLOCK = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
-
-
-def read(path: str) -> Any:
-    """A JSON file of the repository, or the lines of one that has a value a line."""
-    text = (ROOT / path).read_text()
-    return [json.loads(line) for line in text.splitlines()] if path.endswith(".jsonl") else json.loads(text)
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    rows = list(rows)
-    if any(len(row) != len(head) for row in rows):
-        raise ValueError(f"table: expected {len(head)} columns in every row, got {[len(row) for row in rows]}")
-    first, *others = ("|" + "|".join(f" {cell} " if cell else " " for cell in row) + "|\n" for row in (head, *rows))
-    return "".join([first, "|" + "---|" * len(head) + "\n", *others])
-
-
-def evaluated(name: str) -> str:
-    """What `evaluate` says of an input: its `results.json` is kept by the input's name."""
-    found = read(f"experiments/results/evaluated/{name}.json")["methods"]
-    causes = {c: entry["share"] for m in found.values() for c, entry in m["by_cause"].items()}
-    columns: dict[str, Callable[[dict[str, Any]], float]] = {
-        "dB": lambda method: method["psnr"],
-        "SSIM": lambda method: method["ssim"],
-        "ms": lambda method: -method["ms"]["median"],
-    } | {
-        f"{cause} {100 * share:.1f} %": lambda method, cause=cause: method["by_cause"][cause]["psnr"]
-        for cause, share in causes.items()
-    }
-
-    def cell(column: str, value: float) -> str:
-        if column == "ms":
-            return _ms(-value) if value < -1 else f"{-value:.2f}"
-        return f"{value:.3f}" if column == "SSIM" else f"{value:.2f}"
-
-    best = {c: max(get(method) for method in found.values()) for c, get in columns.items() if c != "ms"}
-    rows = []
-    for method, entry in found.items():
-        values = {column: get(entry) for column, get in columns.items()}
-        cells = [f"**{cell(c, v)}**" if best.get(c) == v else cell(c, v) for c, v in values.items()]
-        rows.append([method, *cells])
-    return table(["method", *columns], rows)
 
 
 def search() -> str:
@@ -302,10 +260,6 @@ _BY_SIZE = {name: name for name in ("warp", "occlusion_warp", "guided_warp", "wa
 }
 
 
-def _ms(value: float) -> str:
-    return f"{value:.1f}" if value < 10 else f"{value:.0f}"
-
-
 def sizes() -> str:
     """Error and time of methods by resolution."""
     found = read("experiments/results/resolutions.json")
@@ -313,7 +267,7 @@ def sizes() -> str:
     rows = []
     for name, title in _BY_SIZE.items():
         decibels = [f"{errors[size][name]['psnr']:.2f}" for size in errors]
-        rows.append([title, *decibels, *(_ms(times[size]["whole"][name]) for size in errors)])
+        rows.append([title, *decibels, *(milliseconds(times[size]["whole"][name]) for size in errors)])
     head = [f"{size}{unit if i == 0 else ''}" for unit in (" dB", " ms") for i, size in enumerate(errors)]
     return table(["", *head], rows)
 
@@ -337,10 +291,12 @@ def stage_times() -> str:
     """Milliseconds of ExtraNet's stages, and of its networks alone, by resolution."""
     times = read("experiments/results/resolutions.json")["times"]
     rows = [
-        [title, *(_ms(sum(found["guided_net's stages"][name] for name in names)) for found in times.values())]
+        [title, *(milliseconds(sum(found["guided_net's stages"][name] for name in names)) for found in times.values())]
         for title, names in _STAGES.items()
     ]
-    rows += [[title, *(_ms(found["networks"][name]) for found in times.values())] for title, name in _ALONE.items()]
+    rows += [
+        [title, *(milliseconds(found["networks"][name]) for found in times.values())] for title, name in _ALONE.items()
+    ]
     return table(["guided_net by stage, ms", *times], rows)
 
 
@@ -401,12 +357,7 @@ def masks() -> str:
     return table(["precision / recall", *after["scenes"], "mean"], rows)
 
 
-TABLES: dict[str, Callable[[], str]] = {
-    "map": partial(evaluated, "czest1dm"),
-    "clip": partial(evaluated, "bunker"),
-    "cars": partial(evaluated, "torcs"),
-    "map-stripped": partial(evaluated, "czest1dm_stripped"),
-    "cars-stripped": partial(evaluated, "torcs_stripped"),
+TABLES: dict[str, Callable[[], str]] = scores.TABLES | {
     "extreme-functions": partial(_extreme, "functions"),
     "extreme-methods": partial(_extreme, "methods"),
     "extreme-listed": extreme_listed,

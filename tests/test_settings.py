@@ -370,6 +370,9 @@ SMALL = ("backward_warp", "convert_motion", "demodulate", "log_encode", "tonemap
 VALUES = (*SMALL, "camera_motion", "psnr", "splat", "splat_nearest", "iterative_search", "occlusion_motion")
 
 
+_ROUNDED = {"dis_flow": 5e-5}  # pixels, after some hundred steps that build on each other
+
+
 def same(name, context):
     """Whether an operation gives what it gives by default."""
     function, *arguments = ALL[name]
@@ -379,7 +382,7 @@ def same(name, context):
         found = jax.tree.leaves(function(*arguments))
     for a, b in zip(found, expected, strict=True):
         assert a.dtype == b.dtype
-        np.testing.assert_allclose(a, b, rtol=2e-5, atol=5e-6)
+        np.testing.assert_allclose(a, b, rtol=2e-5, atol=_ROUNDED.get(name, 5e-6))
 
 
 @pytest.mark.parametrize("name", VALUES)

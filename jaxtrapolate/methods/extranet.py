@@ -271,7 +271,8 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
         if share is not None:  # of the guess 1 - share is left, of its correction 1 - share^2
             known = jnp.all(jnp.isfinite(values["warped"]), -1, keepdims=True)
             share, own = jnp.where(known, share, 0), jnp.where(known, own, 0)
-            onward = guess + (1 + share) * (image - guess)
+            begun, factor = guess.astype(image.dtype), 1 + share.astype(image.dtype)
+            onward = begun + factor * (image - begun)
             image = jnp.where(known, jnp.where(onward > 0, onward, 0), image)
         image = jnp.where(values["still"], values["histories"][0].astype(image.dtype), image)
         return outputs(image, guess, own, share)

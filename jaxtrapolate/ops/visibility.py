@@ -113,7 +113,7 @@ def _votes(image: Array, x: Array, y: Array, expected: Array, least: float) -> t
     rows, column, row = image.reshape(-1, 3), jnp.floor(x), jnp.floor(y)
 
     def add(k, sums):
-        j, i = ((n - 1).astype(x.dtype) for n in (k // 4, k % 4))
+        j, i = (jnp.asarray(n - 1, x.dtype) for n in (k // 4, k % 4))
         inside = (column + i >= 0) & (column + i < width) & (row + j >= 0) & (row + j < height)
         index = jnp.where(inside, (row + j) * width + column + i, 0).astype(jnp.int32)
         near, along, down = jnp.moveaxis(take_rows(rows, index), -1, 0)
