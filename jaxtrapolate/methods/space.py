@@ -6,6 +6,7 @@ A mean of a bright and a dark pixel is bright in linear light; after a tone curv
 from collections.abc import Callable
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -20,6 +21,17 @@ Space = Literal["linear", "log", "tone"]
 def space(default: Space = "tone") -> Any:
     """The option; its default is measured in experiments/space.py."""
     return option(default, "in which colours are fetched between pixels", choices=Space)
+
+
+@jax.custom_jvp
+def _at_most(values: Array, most: Array) -> Array:
+    """The smaller of both; the derivative is that of the values, which only rounding makes the larger."""
+    return jnp.minimum(values, most)
+
+
+@_at_most.defjvp
+def _at_most_jvp(primals: Any, tangents: Any) -> Any:
+    return _at_most(*primals), tangents[0]
 
 
 def in_space(space: Space, fetch: Callable[[Array], Array], image: Float[Array, "h w c"]) -> Float[Array, "i j d"]:
@@ -44,7 +56,7 @@ def in_space(space: Space, fetch: Callable[[Array], Array], image: Float[Array, 
     encoded = jnp.where(known, jnp.sign(wide) * curve(usual), wide)
     found = fetch(encoded)
     rest, answer = jnp.split(found, [found.shape[-1] - color.shape[-1]], -1)
-    decoded = jnp.sign(answer) * jnp.minimum(inverse(jnp.abs(answer)), jnp.max(usual))
+    decoded = jnp.sign(answer) * _at_most(inverse(jnp.abs(answer)), jnp.max(usual))
     if answer.shape == encoded.shape:
         decoded = jnp.where(answer == encoded, wide, decoded)
     decoded = jnp.where(jnp.isfinite(answer), decoded, answer).astype(color.dtype)
