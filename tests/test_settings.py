@@ -370,7 +370,7 @@ SMALL = ("backward_warp", "convert_motion", "demodulate", "log_encode", "tonemap
 VALUES = (*SMALL, "camera_motion", "psnr", "splat", "splat_nearest", "iterative_search", "occlusion_motion")
 
 
-_ROUNDED = {"dis_flow": 5e-5}  # pixels, after some hundred steps that build on each other
+_ROUNDED = {"dis_flow": 5e-5, "shading_flow": 5e-5}  # pixels, after some hundred steps that build on each other
 
 
 def same(name, context):
