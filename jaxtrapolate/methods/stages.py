@@ -134,7 +134,7 @@ def modulate_stage(how: Any = None) -> Stage:
         if share is not None:
             own = values["warped"][..., 3:]
             exact = in_space(given.space, partial(backward_warp, motion=values["motion"]), values["newest"].color)
-            plain = jnp.where(values["holes"] | (share < 1), own, exact)
+            plain = jnp.where(values["holes"] | (share < 1), own, exact.astype(own.dtype))
             image = blend(image, plain, share)
         return {"image": image}
 
