@@ -14,6 +14,7 @@ from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.methods import Method, Stage
 from jaxtrapolate.methods.between import time_fraction
 from jaxtrapolate.methods.reprojection import reprojection, steps_onward
+from jaxtrapolate.ops.radiance import compress
 from jaxtrapolate.records import Frame, GBuffer, replace
 
 BETWEEN = ("blend", "half_motion", "grid_warp", "softmax_splat", "dis")
@@ -120,8 +121,11 @@ def test_a_box_before_a_wall(methods, name):
     target, future = Frame(time=at), (layered(1)[0],) if name in BETWEEN else ()
     image = np.asarray(methods[name]((before,), target, future))
     core = box & np.roll(box, 2, 0) & np.roll(box, -2, 0) & np.roll(box, 2, 1) & np.roll(box, -2, 1)
-    limit = 1 if name == "softmax_splat" else 1e-4  # its wall shines through, but less than in a mean (2 apart)
-    assert np.abs(image - truth.color)[core].max() < limit
+    if name == "softmax_splat":  # its wall, 2 below, shines through, but less than in a mean where colours are mixed
+        whole, mixed, wall = (np.asarray(compress(jnp.asarray(a))) for a in (truth.color, image, truth.color - 2))
+        assert ((whole - mixed) / (whole - wall))[core].max() < 0.5
+    else:
+        assert np.abs(image - truth.color)[core].max() < 1e-4
     assert np.array_equal(image[20:], truth.color[20:])
     uncovered = was & ~box & (np.mgrid[: SIZE[0], : SIZE[1]][1] < 6)
     assert np.abs(image - truth.color)[uncovered].mean() < 0.6  # the box is 2 above the wall
@@ -425,7 +429,7 @@ def test_known_figures_of_an_engine_clip(data, name, known):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "least"),
-    [("blend", 24.8), ("dis", 28.1), ("half_motion", 27.1), ("grid_warp", 27.2), ("softmax_splat", 27.2)],
+    [("blend", 24.8), ("dis", 28.1), ("half_motion", 27.1), ("grid_warp", 27.2), ("softmax_splat", 28.3)],
 )
 def test_figures_of_a_path_traced_clip(data, methods, name, least):
     """Frames 6, 8, 10: the clip ends with frame 12, which nothing follows."""
