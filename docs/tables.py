@@ -253,6 +253,12 @@ def curve() -> str:
     return table(["step", *map(str, steps)], rows)
 
 
+def noted(name: str) -> str:
+    """Rows that were noted as they were seen."""
+    found = read(f"experiments/results/{name}.json")
+    return table(found["columns"], found["rows"])
+
+
 _BY_SIZE = {name: name for name in ("warp", "occlusion_warp", "guided_warp", "warp_3d", "grid_extrapolate")} | {
     "guided_net": "**guided_net**",
     "interpolator": "interpolator (both sides)",
@@ -374,6 +380,8 @@ TABLES: dict[str, Callable[[], str]] = scores.TABLES | {
     "ablations": ablations,
     "failures": failures,
     "curve": curve,
+    "rounds": partial(noted, "rounds"),
+    "recipes": partial(noted, "recipes"),
     "sizes": sizes,
     "stage-times": stage_times,
     "masks": masks,

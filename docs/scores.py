@@ -1,0 +1,116 @@
+"""The tables of what `evaluate` said: `experiments/results/evaluated` keeps its `results.json`."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from statistics import fmean
+from typing import Any
+
+from tabulate import milliseconds, read, table
+
+
+def evaluated(name: str) -> str:
+    """What `evaluate` says of an input: its `results.json` is kept by the input's name."""
+    found = read(f"experiments/results/evaluated/{name}.json")["methods"]
+    causes = {c: entry["share"] for m in found.values() for c, entry in m["by_cause"].items()}
+    columns: dict[str, Callable[[dict[str, Any]], float]] = {
+        "dB": lambda method: method["psnr"],
+        "SSIM": lambda method: method["ssim"],
+        "ms": lambda method: -method["ms"]["median"],
+    } | {
+        f"{cause} {100 * share:.1f} %": lambda method, cause=cause: method["by_cause"][cause]["psnr"]
+        for cause, share in causes.items()
+    }
+
+    def cell(column: str, value: float) -> str:
+        if column == "ms":
+            return milliseconds(-value) if value < -1 else f"{-value:.2f}"
+        return f"{value:.3f}" if column == "SSIM" else f"{value:.2f}"
+
+    best = {c: max(get(method) for method in found.values()) for c, get in columns.items() if c != "ms"}
+    rows = []
+    for method, entry in found.items():
+        values = {column: get(entry) for column, get in columns.items()}
+        cells = [f"**{cell(c, v)}**" if best.get(c) == v else cell(c, v) for c, v in values.items()]
+        rows.append([method, *cells])
+    return table(["method", *columns], rows)
+
+
+PAST = ("repeat", "warp", "reproject", "warp_3d", "grid_extrapolate", "occlusion_warp", "guided_warp", "guided_net")
+"""Methods that use the past alone, in the order of their tables."""
+
+BOTH = ("blend", "half_motion", "grid_warp", "dis", "softmax_splat", "interpolator")
+BOTH += ("bidirectional_image", "bidirectional", "bidirectional_guided")
+"""Methods that know the next rendered frame."""
+
+
+def _best(columns: Sequence[Sequence[float]], digits: int = 2) -> list[list[str]]:
+    """Columns of numbers as text, the largest of each in bold."""
+    texts = [[f"{value:.{digits}f}" for value in column] for column in columns]
+    return [
+        [f"**{t}**" if v == max(c) else t for t, v in zip(row, c, strict=True)]
+        for row, c in zip(texts, columns, strict=True)
+    ]
+
+
+def by_scene(names: Sequence[str]) -> str:
+    """dB of methods on the test seeds, the mean over each scene's and over all."""
+    found = read("experiments/results/evaluated/test_seeds.json")
+    inputs: dict[str, list[dict[str, Any]]] = {}
+    for entry in found["inputs"]:
+        inputs.setdefault(entry["input"].split(":")[1], []).append(entry["methods"])
+    columns = [[fmean(methods[name]["psnr"] for methods in group) for name in names] for group in inputs.values()]
+    columns.append([found["methods"][name]["psnr"] for name in names])
+    rows = zip(names, *_best(columns), strict=True)
+    return table(["dB", *inputs, "mean"], [list(row) for row in rows])
+
+
+def by_cause(names: Sequence[str]) -> str:
+    """dB of methods on the test seeds by cause."""
+    found = read("experiments/results/evaluated/test_seeds.json")["methods"]
+    causes = {cause: entry["share"] for cause, entry in found[names[0]]["by_cause"].items()}
+    columns = [[found[name]["by_cause"][cause]["psnr"] for name in names] for cause in causes]
+    head = [f"{cause} {100 * share:.1f} %" for cause, share in causes.items()]
+    return table(["dB by cause", *head], [list(row) for row in zip(names, *_best(columns), strict=True)])
+
+
+_RENAMED = {"extranet": "guided_net"}
+
+_MEASURED = {"czest1dm": "path-traced map", "torcs": "cars", "bunker": "engine clip"}
+
+
+def both_sides() -> str:
+    """dB of methods that know the next frame too, on measured inputs."""
+    found = {name: read(f"experiments/results/evaluated/{name}_both.json")["methods"] for name in _MEASURED}
+    names = [*BOTH, "guided_warp", "guided_net"]
+    columns = [[methods[name]["psnr"] for name in names] for methods in found.values()]
+    titles = [f"{name} (from one side)" if name in PAST else name for name in names]
+    return table(["dB", *_MEASURED.values()], [list(row) for row in zip(titles, *_best(columns), strict=True)])
+
+
+def before() -> str:
+    """dB of methods before holes, light and numbers were mended, and since, in one run on the same frames."""
+    found = {}
+    for name in ("test_seeds", *(f"{name}_both" for name in _MEASURED)):
+        pair = (read(f"experiments/results/evaluated/{folder}{name}.json")["methods"] for folder in ("before/", ""))
+        found[name] = [{_RENAMED.get(key, key): m["psnr"] for key, m in methods.items()} for methods in pair]
+    rows = []
+    for name in (*PAST, *BOTH):
+        cells = [f"{old[name]:.2f} -> {new[name]:.2f}" if name in old else "" for old, new in found.values()]
+        rows.append([name, *cells])
+    return table(["dB, before -> since", "test seeds", *_MEASURED.values()], rows)
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "map": partial(evaluated, "czest1dm"),
+    "clip": partial(evaluated, "bunker"),
+    "cars": partial(evaluated, "torcs"),
+    "map-stripped": partial(evaluated, "czest1dm_stripped"),
+    "cars-stripped": partial(evaluated, "torcs_stripped"),
+    "test-past": partial(by_scene, PAST),
+    "test-both": partial(by_scene, (*BOTH, "guided_warp", "guided_net")),
+    "test-causes": partial(by_cause, PAST),
+    "test-causes-both": partial(by_cause, BOTH),
+    "both-sides": both_sides,
+    "before": before,
+}
+"""Each by its name in the pages."""
