@@ -47,12 +47,12 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=10)
     options = parser.parse_args()
     result: dict = {"seeds": [int(TRAINING_SEEDS[k]) for k in SEEDS], "frames": options.frames, "methods": {}}
-    if options.output.exists():  # methods that were measured before stay
+    if options.output.exists():  # what was measured before stays
         result["methods"] = json.loads(options.output.read_text())["methods"]
     names, spaces = options.methods.split(","), get_args(Space)
     methods = {f"{name}:{space}": jx.load(name, space=space) for name in names for space in spaces}
     for name in names:
-        result["methods"][name] = {}
+        result["methods"].setdefault(name, {})
     for scene in options.scenes.split(","):
         found: dict[str, list[float]] = {key: [] for key in methods}
         for seed in SEEDS:
