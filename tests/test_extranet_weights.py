@@ -285,7 +285,10 @@ def test_imported_weights_are_the_authors(capsys, official, tmp_path):
 
 @pytest.mark.slow
 def test_known_figures_of_a_path_traced_clip(official, data):
-    """The authors' weights, trained on another scene: 28.7 dB, 19.4 in exact disocclusion."""
+    """The authors' weights, trained on another scene: 28.7 dB, 18.4 in exact disocclusion.
+
+    19.4 where disocclusion was told by bilinear depth, which took a fifth of visible pixels for hidden.
+    """
     from jaxtrapolate.evaluation.windows import arguments, windows
     from jaxtrapolate.files import open_sequence
     from jaxtrapolate.ops.visibility import disoccluded
@@ -299,4 +302,4 @@ def test_known_figures_of_a_path_traced_clip(official, data):
         whole.append(float(jx.psnr(made, truth)))
         holes.append(float(jx.psnr(made, truth, mask=hidden)))
     assert 28.7 < np.mean(whole) < 28.9
-    assert 19.4 < np.mean(holes) < 19.8
+    assert 18.3 < np.mean(holes) < 18.6
