@@ -163,11 +163,11 @@ def fetch_loop(image, x, y):
 
 
 @pytest.mark.parametrize("drawn", [False, True])
-def test_half_motion_is_the_loop(methods, drawn):
+def test_half_motion_is_the_loop(drawn):
     """Also where the target has motion: the next frame's then leads to it, and both are chained."""
     first, middle, last = (make_frame(t, SIZE) for t in (0, 1, 2))
     target = hide(middle) if drawn else Frame(time=1.0)
-    image = np.asarray(methods["half_motion"]((first,), target, (last,)))
+    image = np.asarray(jx.load("half_motion", space="linear")((first,), target, (last,)))
     whole = np.asarray(last.motion, np.float64)
     expected = np.zeros((*SIZE, 3))
     for y, x in np.ndindex(SIZE):
@@ -197,7 +197,7 @@ def test_reproject_is_the_warp_and_shades_what_misses():
     (before, _), (after, box) = layered(0), layered(1)
     target = hide(after)
     plain = np.asarray(reprojection()((before,), target))
-    assert np.array_equal(plain, jx.load("warp")((before,), target))
+    assert np.array_equal(plain, jx.load("warp", space="tone")((before,), target))
     asked = []
 
     def shade(target, missed):
