@@ -142,14 +142,14 @@ def fetch(image: Float[Array, "h w"], x: Float[Array, "i j"], y: Float[Array, "i
     return once(sample(image[..., None], x, y, product=jnp.multiply)[..., 0])
 
 
-def bordered(image: Float[Array, "h w"], margin: int, axis: int) -> Float[Array, "h w"]:
+def bordered(image: Float[Array, "h w"], margin: int, axis: int) -> Float[Array, "i j"]:
     """The image with `margin` more pixels at both ends of an axis, which repeat its edge; computed once."""
     padding = [(0, 0), (0, 0)]
     padding[axis] = (margin, margin)
     return once(jnp.pad(image, padding, mode="edge"))
 
 
-def window(padded: Float[Array, "h w"], weights: np.ndarray, axis: int) -> Float[Array, "h w"]:
+def window(padded: Float[Array, "h w"], weights: np.ndarray, axis: int) -> Float[Array, "i j"]:
     """Sums over a window along an axis; the image has a margin of the window's radius there, the result has not."""
     size = padded.shape[axis] - len(weights) + 1
     terms = [
