@@ -157,8 +157,8 @@ def test_options_are_swept_and_fitted():
         pytest.param("dis", {"preset": "ultrafast"}, marks=pytest.mark.slow),
         ("warp", {"space": "tone"}),
         pytest.param("dis", {"space": "log"}, marks=pytest.mark.slow),
-        pytest.param("warp_3d", {"space": "tone"}, marks=pytest.mark.slow),
-        pytest.param("bidirectional_guided", {"space": "tone"}, marks=pytest.mark.slow),
+        pytest.param("warp_3d", {"space": "linear"}, marks=pytest.mark.slow),
+        pytest.param("bidirectional_guided", {"space": "linear"}, marks=pytest.mark.slow),
     ],
 )
 def test_options_count(name, options):
