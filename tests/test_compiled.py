@@ -82,3 +82,18 @@ def test_importing_the_library_keeps_nothing(environment, tmp_path):
     ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert ended.stdout.strip() == "None"
     assert not (tmp_path / "cache").exists()
+
+
+def test_programs_are_forgotten_before_the_memory_maps_run_out():
+    """In a process of its own, which then answers as before; far from the limit nothing is forgotten."""
+    code = """if True:
+        import jax, jax.numpy as jnp
+        from jaxtrapolate.runtime.compiled import spare_memory_maps
+        double = jax.jit(lambda a: 2 * a)
+        first = double(jnp.ones(3))
+        print(spare_memory_maps(), double._cache_size(), spare_memory_maps(0.0), double._cache_size())
+        print((double(jnp.ones(3)) == first).all())
+    """
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    expected = "False 1 True 0" if sys.platform == "linux" else "False 1 False 1"
+    assert ended.stdout.split("\n")[:2] == [expected, "True"]

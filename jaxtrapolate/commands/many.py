@@ -8,6 +8,7 @@ from jaxtrapolate.errors import InputError
 from jaxtrapolate.evaluation.score import mean_over_inputs
 from jaxtrapolate.report import write_report
 from jaxtrapolate.results import InputResult, MethodResult, Results
+from jaxtrapolate.runtime.compiled import spare_memory_maps
 from jaxtrapolate.runtime.output import open_output, write_json
 from jaxtrapolate.runtime.timing import machine
 
@@ -55,6 +56,7 @@ def _each(
 
         try:
             follow("read", 0, 1)
+            spare_memory_maps()
             results = evaluate(entry.open(), folder=folder / entry.name, reuse=True, step=follow)
             done[entry.name] = (_summary(entry.name, results), results)
         except InputError as error:

@@ -5,6 +5,7 @@ The commands use it, so that a second run of the same sizes starts at once; who 
 """
 
 import contextlib
+import gc
 import os
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -42,6 +43,28 @@ def forget_compiled_programs() -> None:
     import jax
 
     jax.config.update("jax_enable_compilation_cache", False)
+
+
+def spare_memory_maps(share: float = 0.6) -> bool:
+    """Forgets compiled programs where they have taken up a share of the memory maps that Linux gives a process.
+
+    Each program keeps some, and XLA ends a process that gets no more. What is needed again is compiled again, or read
+    from the cache. To be called where much that was compiled will not be: between inputs.
+
+    Returns:
+        Whether they were forgotten; never where the system does not say how many maps there are.
+    """
+    try:
+        with open("/proc/self/maps", "rb") as maps, open("/proc/sys/vm/max_map_count", "rb") as most:
+            if sum(1 for _ in maps) < share * int(most.read()):
+                return False
+    except OSError:
+        return False
+    import jax
+
+    jax.clear_caches()
+    gc.collect()
+    return True
 
 
 @contextlib.contextmanager
