@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxtrapolate.checks import ArrayLike
 from jaxtrapolate.methods.options import option
 from jaxtrapolate.ops.radiance import compress, expand
 from jaxtrapolate.precision import widest
@@ -34,7 +35,7 @@ def _at_most_jvp(primals: Any, tangents: Any) -> Any:
     return _at_most(*primals), tangents[0]
 
 
-def in_space(space: Space, fetch: Callable[[Array], Array], image: Float[Array, "h w c"]) -> Float[Array, "i j d"]:
+def in_space(space: Space, fetch: Callable[[Array], Array], image: Float[ArrayLike, "h w c"]) -> Float[Array, "i j d"]:
     """What `fetch` takes from an image, whose values it mixes in another space.
 
     A pixel that is fetched unmixed from its own place is its value bit for bit. In another space than linear light
