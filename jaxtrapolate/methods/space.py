@@ -47,9 +47,9 @@ def in_space(space: Space, fetch: Callable[[Array], Array], image: Float[ArrayLi
         fetch: from an image to an image, whose last channels are the colours.
         image: linear light `[H, W, C]`.
     """
-    if space == "linear":
-        return fetch(image)
     color = jnp.asarray(image)
+    if space == "linear":
+        return fetch(color)
     wide = color.astype(widest(color))
     known = jnp.isfinite(wide)
     usual = jnp.where(known, jnp.abs(wide), 0)
