@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import slow
 from oracles import look, perspective, random, random_motion
 
 import jaxtrapolate as jx
@@ -242,3 +243,17 @@ def test_another_value_of_an_option_traces_nothing(name):
         for value in (0.5, 0.75, 3.0):
             OPTIONS[name](value)
     assert count() == 0
+
+
+FLOWS = {
+    "farneback": lambda a, b: jx.farneback_flow(a, b),
+    "dis": lambda a, b: jx.dis_flow(a, b),
+    "shading": lambda a, b: jx.shading_flow(a, b, guide=a)[0],
+}
+
+
+@pytest.mark.parametrize("name", ["farneback", *slow("dis", "shading")])
+def test_annotations_of_flows_hold(name):
+    """Traced alone, with the checks that the tests of their values do without."""
+    image = jnp.zeros((40, 48, 1), jnp.float32)
+    assert jax.eval_shape(FLOWS[name], image, image).shape == (40, 48, 2)
