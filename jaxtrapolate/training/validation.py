@@ -1,6 +1,6 @@
 """Validation: windows that training does not see, played by the method that is trained, as evaluation plays frames."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -45,7 +45,8 @@ class Validation:
 
     def __init__(self, windows: Sequence[Window], name: str, baseline: Method, *, holes: bool = False) -> None:
         self._windows = windows
-        self._holes = [_holes(baseline, w) if holes else None for w in windows]
+        find = _hole_finder(baseline)
+        self._holes = [find(w) if holes else None for w in windows]
         self._constant, _ = self._play(name, baseline)
 
     def __call__(self, method: Method) -> tuple[dict[str, float], dict[str, np.ndarray]]:
@@ -72,13 +73,14 @@ class Validation:
         return scores, images
 
 
-def _holes(method: Method, window: Window) -> Bool[Array, "h w 1"]:
-    """Where the newest rendered frame shows another surface."""
+def _hole_finder(method: Method) -> Callable[[Window], Bool[Array, "h w 1"]]:
+    """Where the newest rendered frame of a window shows another surface; compiled once for each structure."""
 
+    @jax.jit
     def holes(state: Any, *frames: Any) -> Array:
         return method.values_before("network", state, (), *frames)["holes"]
 
-    return jax.jit(holes)(method.state, window.history, window.target)
+    return lambda window: holes(method.state, window.history, window.target)
 
 
 @jax.jit
