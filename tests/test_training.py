@@ -255,6 +255,14 @@ def test_a_run_begins_with_given_weights(whole, tmp_path):
         with pytest.raises(InputError, match=message):
             train_and_evaluate(dataclasses.replace(settings, start=str(start)), tmp_path / "wrong", task=ToyTask())
         shutil.rmtree(tmp_path / "wrong")
+
+    class Adapting(Watched):
+        adapts = ("norm",)
+
+    other = save_weights(tmp_path, "toy", loaded.tree, **about)
+    train_and_evaluate(dataclasses.replace(settings, start=str(other)), tmp_path / "adapts", task=Adapting())
+    (line,) = [entry for entry in read_metrics(tmp_path / "adapts") if entry["kind"] == "start"]
+    assert "norm was false" in line["other than the weights were trained on"]
     with pytest.raises(InputError, match="no default weights"):
         train_and_evaluate(dataclasses.replace(settings, start="default"), tmp_path / "wrong", task=ToyTask())
 

@@ -16,6 +16,7 @@ from jaxtrapolate.methods import (
     interpolator,
     opticalflow,
     reprojection,
+    shading,
     warping,
 )
 from jaxtrapolate.methods.frames import neighbours as neighbours
@@ -30,6 +31,7 @@ _METHODS: dict[str, Callable[[], Method]] = {
     "warp": warping.warp,
     "occlusion_warp": warping.occlusion_warp,
     "guided_warp": warping.guided,
+    "shading_warp": shading.shading_warp,
     "blend": blending.blend,
     "reproject": reprojection.reprojection,
     "half_motion": blending.half_motion,
@@ -41,6 +43,7 @@ _METHODS: dict[str, Callable[[], Method]] = {
     "bidirectional_image": bidirectional.bidirectional_image,
     "bidirectional": bidirectional.bidirectional,
     "bidirectional_guided": bidirectional.bidirectional_guided,
+    "bidirectional_shading": shading.bidirectional_shading,
 }
 
 
@@ -59,8 +62,8 @@ _DESCRIBED: dict[str, Callable[..., Method]] = _METHODS | {
 }
 
 BEST_FIRST = (
-    *("bidirectional_guided", "bidirectional", "guided_net", "guided_warp", "bidirectional_image", "interpolator"),
-    *("occlusion_warp", "softmax_splat", "dis", "warp", "blend", "repeat"),
+    *("bidirectional_shading", "bidirectional_guided", "bidirectional", "guided_net", "shading_warp", "guided_warp"),
+    *("bidirectional_image", "interpolator", "occlusion_warp", "softmax_splat", "dis", "warp", "blend", "repeat"),
 )
 """Methods by what they have been worth on embedded scenes: what is used where none is named is the first that can."""
 

@@ -21,6 +21,8 @@ from jaxtrapolate.errors import printable
 from jaxtrapolate.methods.hindsight import hindsight_stage
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import settings
+from jaxtrapolate.methods.seen import OLDER, Remembered, seen_before_stage
+from jaxtrapolate.methods.shading import Continued, light_stages
 from jaxtrapolate.methods.space import Space, in_space
 from jaxtrapolate.methods.stage import Needed, Stage, Values
 from jaxtrapolate.methods.stages import (
@@ -57,7 +59,8 @@ class Preparation:
 
     Attributes:
         first_guess: x's first three channels, which the network corrects: the newest frame by the "warp" along the
-            motion, or by the "guided" warp (albedo and normals, else the stencil; without any, the warp).
+            motion, or by the "guided" warp (albedo and normals, else the stencil; without any, the warp), or that with
+            its light moved on and its holes filled from older frames ("shading", as of `shading_warp`).
         by, floor: of `demodulate`; with floor 0 what reflects nothing is 0.
         sky: whether the sky's colour is fed undivided; else demodulated like the rest, by the albedo stored there.
         outside: what a warp fetches beyond the frame.
@@ -68,7 +71,7 @@ class Preparation:
         space: in which colours are fetched between pixels.
     """
 
-    first_guess: Literal["warp", "guided"] = "warp"
+    first_guess: Literal["warp", "guided", "shading"] = "warp"
     by: By = "albedo+specular"
     floor: float = 1e-2
     sky: bool = True
@@ -87,7 +90,7 @@ class Preparation:
 
 
 _CHOICES = {
-    "first_guess": ("warp", "guided"),
+    "first_guess": ("warp", "guided", "shading"),
     "by": get_args(By),
     "outside": ("edge", "zero"),
     "taps": get_args(Taps),
@@ -189,6 +192,15 @@ class Correction(Guide):
     margin: float = margin()
 
 
+@settings
+class LitCorrection(Remembered, Continued, Correction):
+    """Of `shading_warp`, which makes the first guess."""
+
+
+_SETTINGS = {"warp": (), "guided": Correction(), "shading": LitCorrection()}
+"""By first guess."""
+
+
 def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
     def function(state, values: Values):
         warped = [encode(image) for image in values["histories"]]
@@ -206,7 +218,7 @@ def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
         }
         motions, still = values["motions"], jnp.zeros_like(values["holes"])
         if len(motions) > 1:  # with one rendered frame it is not known whether anything changes
-            still = standing([source.color for source in values["sources"]], *motions)
+            still = standing([source.color for source in values["sources"][: len(motions)]], *motions)
         return {"inputs": inputs, "still": still}
 
     takes = ("target", "layers", "masks", "sources", "motions", "histories", "warped", *COMPOSITE)
@@ -245,14 +257,14 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
     if config.features not in (0, 6) or not 1 <= config.warps <= 2:
         raise ValueError(f"model: expected 6 features or none and 1 or 2 warped images, got {config}")
     function, weights = inference(model)
-    guided = (
-        (dataclasses.replace(guided_stage(preparation.space), optional=True),)
-        if preparation.first_guess == "guided"
-        else ()
-    )
+    guided = ()
+    if preparation.first_guess != "warp":
+        guided += (dataclasses.replace(guided_stage(preparation.space), optional=True),)
+    if preparation.first_guess == "shading":
+        guided += (*light_stages(preparation.space), seen_before_stage(preparation.space))
 
     def warp(state, values: Values):
-        pairs = zip(values["layers"], values["motions"], strict=True)
+        pairs = zip(values["layers"], values["motions"], strict=False)  # to older ones no motion leads
         warped = tuple(
             in_space(preparation.space, partial(backward_warp, motion=motion, outside=preparation.outside), image)
             for image, motion in pairs
@@ -295,9 +307,9 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
             plain = in_space(preparation.space, partial(composite, values), values["newest"].color)
         return {"image": jnp.where(values["target"].gbuffer.sky > 0.5, plain.astype(image.dtype), image)}
 
-    past = max(1, config.histories)
+    past, more = max(1, config.histories), OLDER if preparation.first_guess == "shading" else 0
     stages = (
-        reproject_stage(past),
+        reproject_stage(past, more=more),
         holes_stage(preparation.taps, position_threshold=preparation.position_threshold),
         dataclasses.replace(OCCLUSION, optional=True),
         *((hindsight_stage(preparation),) if guided else ()),
@@ -323,8 +335,8 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
         ),
         SKY,
     )
-    given = Correction() if guided else ()
-    return Method(name, stages, past=past, weights=weights, settings=given, networks={"network": function})
+    given = _SETTINGS[preparation.first_guess]
+    return Method(name, stages, past=past + more, weights=weights, settings=given, networks={"network": function})
 
 
 def first_guess(method: Method) -> Method:

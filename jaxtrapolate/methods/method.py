@@ -248,9 +248,11 @@ class Method:
         following = [future[i] for i in upcoming(future)][: self.future]
         roles = {"target": [target], "history": sources, "future": following, "newest": sources[:1]}
         newest, previous = (*rendered(history), -1, -1)[:2]
+        oldest = min(rendered(history)[: self.past], default=-1)
         between = {
             "since_newest": history[newest + 1 :],
             "before_newest": history[previous + 1 : max(newest, 0)],
+            "since_oldest": history[oldest + 1 : newest + 1],
             "before_next": future[: (*upcoming(future), len(future))[0]],
         }
 

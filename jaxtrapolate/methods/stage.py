@@ -41,6 +41,7 @@ class Stage:
             method takes; "newest", the newest of history; and what was not rendered, every frame if there is any, which
             motion chains through: "since_newest", in history after the newest rendered frame, "before_newest", between
             that and the rendered one before it, and "before_next", in future before the next rendered frame.
+            "since_oldest" is all from after the oldest rendered frame that the method takes on to the newest, that too.
         optional: whether the method does without it: left out where a buffer is missing. Without a stage that is not
             optional the method cannot run.
         group: of optional stages that make sense together alone: if one is left out all of that name are.

@@ -78,12 +78,14 @@ def _train(
     folder = output.folder
     step = make_step(task, config)
     with Checkpoints(folder / "checkpoints", keep=config.keep, score=task.score) as checkpoints:
-        state, start = step.create(), checkpoints.latest() or 0
+        state, start, differ = step.create(), checkpoints.latest() or 0, ""
         if start:
             state = checkpoints.restore(start, state)
         elif config.start is not None:
-            state = _begun(state, config.start, task)
+            state, differ = _begun(state, config.start, task)
         journal = Journal(folder, active=first, step=start)
+        if differ:
+            journal.write("start", start, {"other than the weights were trained on": differ})
         if start and output.code_before is not None:
             journal.write("code", start, {"before": output.code_before, "now": code()})
         ahead = jax.default_backend() != "cpu" if ahead is None else ahead
@@ -95,16 +97,21 @@ def _train(
     return {name: value for name, value in validated[-1].items() if name not in ("kind", "step")}
 
 
-def _begun(state: State, start: str, task: Task) -> State:
-    """The initial state with the weights of a file, which have to be of the same method and configuration."""
-    method = task.about["method"]
+def _begun(state: State, start: str, task: Task) -> tuple[State, str]:
+    """The initial state with the weights of a file, and what differs of what the task lets differ.
+
+    They have to be of the same method, and of the same configuration but for the parts that the task names in `adapts`.
+    """
+    method, free, changed = task.about["method"], getattr(task, "adapts", ()), ""
     try:
         weights = read_weights(default_weights(method) if start == "default" else start)
         if weights.method is not None:
-            own = {"method": weights.method, **weights.config}
-            if differ := differences(own, {"method": method, **task.about["config"]}):
+            own, wanted = {"method": weights.method, **weights.config}, {"method": method, **task.about["config"]}
+            fixed = ({k: v for k, v in table.items() if k not in free} for table in (own, wanted))
+            if differ := differences(*fixed):
                 raise ValueError(f"start: {weights.source} holds weights of another kind: {differ}")
-        return started(state, weights)
+            changed = differences(own, wanted)
+        return started(state, weights), changed
     except OSError as error:
         raise os_input_error(start, error) from error
     except ValueError as error:

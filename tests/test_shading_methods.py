@@ -1,0 +1,172 @@
+"""Methods whose light goes on moving: exact shadows over exact surfaces, and all that must change nothing."""
+
+import dataclasses
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from marks import slow
+
+import jaxtrapolate as jx
+from jaxtrapolate.methods.shading import steps_on
+from jaxtrapolate.records import Frame, GBuffer, replace
+
+SIZE = (66, 100)
+PAN = 1.5  # pixels that surfaces move left in a frame
+SPEED = np.float64([2.0, -1.0])  # of the shadow over the surfaces, pixels in a frame
+
+
+@pytest.fixture(autouse=True)
+def plain(unchecked):
+    """NumPy arrays are taken, and the library's own errors seen."""
+
+
+def lit(time, *, speed=SPEED, pan=PAN):
+    """The light at a time: even, but for a soft round shadow that moves over the surfaces."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.float64)
+    away = np.hypot(x + pan * time - 48 - speed[0] * time, y - 34 - speed[1] * time)
+    return 1.2 - 0.9 / (1 + np.exp((away - 15) / 1.2))
+
+
+def frame(time, *, speed=SPEED, pan=PAN, light=None, stamped=True, buffers=True):
+    """A textured wall seen by a camera that pans, lit by `lit` or by `light` times that of no shadow."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.float64)
+    albedo = 0.5 + 0.2 * np.sin((x + pan * time) / 5) * np.cos(y / 7)
+    albedo = albedo[..., None] * [1.0, 0.8, 0.6]
+    irradiance = lit(time, speed=speed, pan=pan) if light is None else np.full(SIZE, 1.2 * light)
+    motion = np.broadcast_to([pan, 0.0], (*SIZE, 2))
+    flat = np.ones((*SIZE, 1))
+    shown = {"albedo": albedo, "normal": flat * [0.0, 0.0, 1.0]} if buffers else {}
+    arrays = shown | {"depth": 5 * flat, "stencil": 0 * flat}
+    return Frame(
+        color=jnp.asarray(albedo * irradiance[..., None], jnp.float32),
+        motion=jnp.asarray(motion, jnp.float32),
+        gbuffer=GBuffer(**{k: jnp.asarray(v, jnp.float32) for k, v in arrays.items()}),
+        time=jnp.float32(time) if stamped else None,
+    )
+
+
+def hide(frame):
+    return replace(frame, color=None)
+
+
+def window(past, make=frame):
+    """History of `past` rendered frames with those between, at -1, -3, ..., and the target at 0."""
+    frames = [make(t) if t % 2 else hide(make(t)) for t in range(1 - 2 * past, 0)]
+    return tuple(frames), hide(make(0)), make(0).color
+
+
+def db(image, truth):
+    inner = np.s_[6:-6, 14:-14]  # away from where the picture comes in
+    images = (jx.tonemap(jnp.asarray(a)[inner]) for a in (image, truth))
+    return float(jx.psnr(*images))
+
+
+@functools.cache
+def method(name):
+    return jx.load(name)
+
+
+@pytest.mark.parametrize("past", [3, *slow(2)])
+def test_shadow_goes_on(past):
+    history, target, truth = window(past)
+    before, after = (db(method(name)(history, target), truth) for name in ("guided_warp", "shading_warp"))
+    assert after > before + 8
+    assert after > 38
+
+
+@pytest.mark.slow
+def test_shadow_goes_on_without_times_and_without_normals():
+    for make in (functools.partial(frame, stamped=False), functools.partial(frame, buffers=False)):
+        history, target, truth = window(3, make)
+        before, after = (db(method(name)(history, target), truth) for name in ("guided_warp", "shading_warp"))
+        assert after > before + 6
+
+
+def test_one_rendered_frame_is_the_guided_warp():
+    history, target, _ = window(1)
+    assert np.array_equal(method("shading_warp")(history, target), method("guided_warp")(history, target))
+
+
+def test_light_that_stands_still_is_the_guided_warp():
+    """Bit for bit; so is what blinks, where two frames differ by no motion."""
+    for light in ((1, 1, 1), (1, 1.5, 0.7)):
+        steps = dict(zip((-5, -3, -1), light, strict=True))
+        history, target, _ = window(3, lambda t, steps=steps: frame(t, light=steps.get(t, 1)))
+        assert np.array_equal(method("shading_warp")(history, target), method("guided_warp")(history, target))
+
+
+def test_no_stage_works_where_no_light_changes():
+    """What is skipped gives what would have been made."""
+    history, target, _ = window(3, functools.partial(frame, light=1))
+    whole = method("shading_warp")
+    always = dataclasses.replace(whole, stages=tuple(dataclasses.replace(s, needed=None) for s in whole.stages))
+    assert np.array_equal(whole(history, target), always(history, target))
+
+
+def test_light_that_turned_is_not_followed():
+    """The older frames saw the shadow come from elsewhere: hindsight does not trust what confidence alone would."""
+    turned = functools.partial(frame, speed=SPEED)
+
+    def make(time):
+        return turned(time) if time >= -3 else frame(time, speed=-SPEED * 3, pan=PAN)
+
+    history, target, truth = window(3, make)
+    both = method("shading_warp")
+    careless = both.without("light in hindsight")
+    far = np.asarray(careless(history, target)) - np.asarray(method("guided_warp")(history, target))
+    near = np.asarray(both(history, target)) - np.asarray(method("guided_warp")(history, target))
+    assert np.square(near).sum() < 0.5 * np.square(far).sum()
+    assert np.isfinite(truth).all()
+
+
+def test_a_cut_does_no_harm():
+    rng = np.random.default_rng(0)
+    other = jnp.asarray(rng.uniform(0, 1, (*SIZE, 3)), jnp.float32)
+    history, target, truth = window(3)
+    history = tuple(replace(f, color=other) if f.color is not None else f for f in history[:-1]) + history[-1:]
+    before, after = (db(method(name)(history, target), truth) for name in ("guided_warp", "shading_warp"))
+    assert after > before - 0.05
+
+
+def test_steps_by_times_and_by_counts():
+    frames = tuple(replace(frame(t), time=jnp.float32(time)) for t, time in ((-3, 1.0), (-2, 2.0), (-1, 5.0)))
+    at = replace(frame(0), time=jnp.float32(6.0))
+    assert float(steps_on(frames, 0, 2, at, 1)) == 0.25
+    assert float(steps_on(frames, 0, 2, replace(at, time=None), 1)) == 0.5
+    assert float(steps_on((frames[0], frames[0]), 0, 1, at, 1)) == 1.0  # times that do not differ
+
+
+def between(alpha_of=0):
+    history, target, truth = window(1)
+    return history, target, (frame(1),), truth
+
+
+def test_light_between_two_frames():
+    history, target, future, truth = between()
+    before, after = (
+        db(method(name)(history, target, future), truth) for name in ("bidirectional_guided", "bidirectional_shading")
+    )
+    assert after > before + 6
+    assert after > 40
+
+
+@pytest.mark.slow
+def test_light_at_any_time_between_two_frames():
+    """A quarter of the way, the shadow is there."""
+    history = (frame(-1),)
+    target, truth = hide(frame(-0.5)), frame(-0.5).color
+    target = replace(target, motion=target.motion / 2)
+    future = (replace(frame(1), motion=1.5 * frame(1).motion),)
+    before, after = (
+        db(method(name)(history, target, future), truth) for name in ("bidirectional_guided", "bidirectional_shading")
+    )
+    assert after > before + 5
+
+
+def test_light_that_stands_still_between_two_frames():
+    still = functools.partial(frame, light=1)
+    history, target, _ = window(1, still)
+    images = [method(n)(history, target, (still(1),)) for n in ("bidirectional_guided", "bidirectional_shading")]
+    assert np.array_equal(*images)
