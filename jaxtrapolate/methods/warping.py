@@ -3,6 +3,7 @@
 from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from jaxtrapolate.methods.frames import rendered
@@ -143,17 +144,33 @@ def fetch_guided(image, motion, holes, target, source, how: Any, space: Space):
     return in_space(space, fetch, image)
 
 
+_AGREES = 0.03
+"""Squared difference of the guides up to which the four pixels around where the motion leads are what is looked for."""
+
+
 def guided_stage(space: Space | None = None) -> Stage:
     """Fetches the newest layer from the most similar pixels around where the motion leads; see `fetch_guided`.
 
+    The undivided colour, where there is no hole and the guides between the pixels there are the target's, is fetched
+    bilinearly: no guide says where a panel that shines ends. On 48 windows of training seeds of eight scenes that is
+    worth 0.02 to 0.12 dB on each, 0.07 dB on the mean; without looking at the guides 0.03, and two scenes lose 0.1.
+
     Args:
-        space: `None` = the method's option.
+        space: what a network was trained with, whose correction the undivided colour has no part in: that is then
+            fetched after the tone curve (0.05 dB; like the rest, in linear light, it loses 0.04). `None` = the
+            method's option, for all.
     """
 
     def function(state, values: Values):
         frames, how = (values["target"].gbuffer, values["newest"].gbuffer), state.settings
         layer, motion, holes = values["layers"][0], values["motion"], values["holes"]
         warped = fetch_guided(layer, motion, holes, *frames, how, space or how.space)
+        if layer.shape[-1] > 3:
+            wanted, there = map(jax.lax.stop_gradient, guides(*frames, motion))
+            apart = jnp.sum(jnp.square(wanted - backward_warp(there, motion)), -1, keepdims=True)
+            plain = in_space("tone" if space else how.space, partial(backward_warp, motion=motion), layer[..., 3:])
+            own = jnp.where(~holes & (apart <= _AGREES), plain, warped[..., 3:])
+            warped = jnp.concatenate([warped[..., :3], own], -1)
         return {"warped": warped, "image": warped[..., :3]}
 
     takes = ("target", "newest", "layers", "motion", "holes")
