@@ -92,16 +92,15 @@ def both_sides() -> str:
 def before() -> str:
     """dB of methods before holes, light and numbers were mended, and since, in one run on the same frames."""
     found = {}
-    for name in _MEASURED:
-        pair = (
-            read(f"experiments/results/evaluated/{folder}{name}_both.json")["methods"] for folder in ("before/", "")
-        )
+    columns = {"test_seeds": "embedded scenes"} | {f"{name}_both": title for name, title in _MEASURED.items()}
+    for name in columns:
+        pair = (read(f"experiments/results/evaluated/{folder}{name}.json")["methods"] for folder in ("before/", ""))
         found[name] = [{_RENAMED.get(key, key): m["psnr"] for key, m in methods.items()} for methods in pair]
     rows = []
     for name in (*PAST, *BOTH):
         cells = [f"{old[name]:.2f} -> {new[name]:.2f}" if name in old else "" for old, new in found.values()]
         rows += [[name, *cells]] if any(cells) else []
-    return table(["dB, before -> since", *_MEASURED.values()], rows)
+    return table(["dB, before -> since", *columns.values()], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {

@@ -64,6 +64,11 @@ def test_what_stands_still_is_found_tile_by_tile():
     assert standing((image[:1, :1], image[:1, :1])).all()
 
 
+def psnr(image, truth, mask):
+    """As displayed, where a mask `[H, W]` says."""
+    return float(jx.psnr(jx.tonemap(image), jx.tonemap(truth), mask=jnp.asarray(mask[..., None])))
+
+
 # Networks with their default weights
 
 
@@ -77,7 +82,10 @@ def lit(time, *, lamp=1.0, step=2, size=(48, 72), albedo=False):
     motion = np.broadcast_to(np.float32([step, 0]), (*size, 2))
     normal = np.broadcast_to(np.float32([0, 0, 1]), (*size, 3))
     buffers = jx.GBuffer(
-        normal=normal, depth=np.full((*size, 1), 5, np.float32), stencil=np.zeros((*size, 1), np.float32)
+        albedo=np.full((*size, 3), 0.5, np.float32) if albedo else None,
+        normal=normal,
+        depth=np.full((*size, 1), 5, np.float32),
+        stencil=np.zeros((*size, 1), np.float32),
     )
     return jax.tree.map(jnp.asarray, jx.Frame(color, buffers, motion, time=float(time))), on
 
@@ -100,6 +108,19 @@ def test_a_lamp_does_not_ring():
     assert np.abs(np.log1p(image) - np.log1p(truth))[wall].max() < 0.1
 
 
+@pytest.mark.parametrize("lamp", [1.0, pytest.param(100.0, marks=pytest.mark.slow), 3e4])
+@pytest.mark.parametrize("name", ["guided_warp", "guided_net"])
+def test_beside_a_lamp_the_wall_is_as_it_was(name, lamp):
+    """One to four pixels from it, and in it: motion by whole pixels is no mean of both."""
+    frames = [lit(time, lamp=lamp, albedo=True)[0] for time in range(6)]
+    history = tuple(frame if time % 2 == 0 else without_color(frame) for time, frame in enumerate(frames[:5]))
+    method = jx.load(name)
+    image = method(history[-(2 * method.past - 1) :], without_color(frames[5]))
+    on = lit(5)[1]
+    near = np.any([np.roll(on, (j, i), (0, 1)) for j in range(-4, 5) for i in range(-4, 5)], 0)
+    assert psnr(image, frames[5].color, near) > {"guided_warp": 50, "guided_net": 60}[name]
+
+
 def test_a_still_lamp_is_interpolated_exactly():
     frame = lit(0, lamp=100.0)[0]
     pair = (replace(frame, time=0.0),), jx.Frame(time=1.0), (replace(frame, time=2.0),)
@@ -119,6 +140,23 @@ def glowing(time, size=(56, 88)):
     one = np.ones((*size, 1), np.float32)
     buffers = jx.GBuffer(albedo=albedo, normal=normal, depth=5 * one, stencil=0 * one, roughness=one, metallic=0 * one)
     return jax.tree.map(jnp.asarray, jx.Frame(np.float32(color), buffers, motion, time=float(time))), panel
+
+
+def test_the_edges_of_what_shines_do_not_break():
+    """No guide says where a panel ends: beside its edges the guided warp is the composite, which fetches bilinearly."""
+    frames = [glowing(time)[0] for time in range(6)]
+    history = tuple(frame if time % 2 == 0 else without_color(frame) for time, frame in enumerate(frames[:5]))
+    panel = glowing(5)[1]
+    edge = np.zeros_like(panel)
+    inner = slice(4, -4), slice(4, -14)
+    edge[inner] = np.any([np.roll(panel, by, axis) != panel for axis in (0, 1) for by in (-1, 1)], 0)[inner]
+
+    def decibels(name):
+        method = jx.load(name)
+        image = method(history[-(2 * method.past - 1) :], without_color(frames[5]))
+        return psnr(image, frames[5].color, edge)
+
+    assert decibels("guided_warp") > decibels("occlusion_warp") - 0.3
 
 
 def test_no_texture_is_printed_on_what_shines():
