@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import slow
 
 import jaxtrapolate as jx
 from jaxtrapolate.ops.projection import fitted_projection, project
@@ -22,7 +23,7 @@ def grid(size):
     return np.stack([x, y], -1)
 
 
-@pytest.mark.parametrize("name", ["interior", "forest"])
+@pytest.mark.parametrize("name", ["interior", *slow("forest")])
 def test_fitted_to_a_scene(name):
     """To a hundredth of a pixel where its own camera shows the points, at another time too."""
     sequence = SceneSequence(name, TRAINING_SEEDS[3], frames=9, size=SIZE)

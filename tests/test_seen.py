@@ -67,7 +67,7 @@ def window(past, make=frame):
 
 @functools.cache
 def method():
-    return jx.load("shading_warp")
+    return jx.load("shading_warp").without("light before")
 
 
 def hidden(history, target):

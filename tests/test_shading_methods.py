@@ -97,6 +97,7 @@ def test_light_that_stands_still_is_the_guided_warp():
         assert np.array_equal(method("shading_warp")(history, target), method("guided_warp")(history, target))
 
 
+@pytest.mark.slow
 def test_no_stage_works_where_no_light_changes():
     """What is skipped gives what would have been made."""
     history, target, _ = window(3, functools.partial(frame, light=1))
@@ -105,6 +106,7 @@ def test_no_stage_works_where_no_light_changes():
     assert np.array_equal(whole(history, target), always(history, target))
 
 
+@pytest.mark.slow
 def test_light_that_turned_is_not_followed():
     """The older frames saw the shadow come from elsewhere: hindsight does not trust what confidence alone would."""
     turned = functools.partial(frame, speed=SPEED)

@@ -245,15 +245,11 @@ def lit(time):
 OPTIONAL = [(name, s.name) for name in default_methods() for s in jx.load(name).stages if s.optional]
 
 
-LONG = ("guided_net", "bidirectional_guided")
+LONG = ("guided_net", "bidirectional_guided", "shading_warp", "bidirectional_shading")
 
 
 @pytest.mark.parametrize(
-    ("name", "left_out"),
-    [
-        pytest.param(*p, marks=pytest.mark.slow) if p[0] in ("guided_net", "bidirectional_guided") else p
-        for p in OPTIONAL
-    ],
+    ("name", "left_out"), [pytest.param(*p, marks=pytest.mark.slow) if p[0] in LONG else p for p in OPTIONAL]
 )
 def test_any_optional_stage_may_be_left_out(name, left_out):
     """Never is light shown that was not multiplied by the reflectance again: that would be white."""

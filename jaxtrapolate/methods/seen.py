@@ -143,6 +143,9 @@ def seen_before_stage(space: Space | None = None) -> Stage:
     def function(state, values: Values):
         how, history, target = state.settings, values["history"], values["target"]
         warped, left = values["warped"], values["holes"]
+        around = ~left  # whose light is compared: what stands, where ids tell it
+        if target.gbuffer.stencil is not None:
+            around &= target.gbuffer.stencil < 0.5
         pairs = zip(rendered(history)[1:], values["sources"][1:], values["layers"][1:], strict=False)
         for place, source, layer in pairs:
             motion, seen = seen_at(history, target, place)
@@ -154,7 +157,7 @@ def seen_before_stage(space: Space | None = None) -> Stage:
                     return guided_warp(image, motion, *guide, strides=(1,), keep=how.keep, **sigmas)
 
                 found = in_space(space or how.space, fetch, layer)
-                both = seen & ~values["holes"]
+                both = seen & around
                 first, then = (image[..., :3] for image in (warped, found))
                 factor = _ratio(first, then, both, jnp.asarray(how.relight)).astype(found.dtype)
                 found = jnp.concatenate([found[..., k : k + 3] * factor for k in range(0, found.shape[-1], 3)], -1)

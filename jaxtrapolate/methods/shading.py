@@ -42,6 +42,7 @@ from jaxtrapolate.precision import divide, share, widest
 from jaxtrapolate.records import Frame, GBuffer
 
 _SURE = 0.1  # of hindsight's share: from no trust to all of it
+_MUCH = 0.01  # squared difference after the curve: light is another
 _SIGMA = 1.0  # of normals; that of `shading_flow` loses 0.3 dB on one of six training seeds, and gains nothing
 _LOGARITHM = 10.0  # of the depth as a guide: 10 % of the depth is one sigma
 
@@ -111,10 +112,17 @@ def _flows(pairs: Sequence[Pair], how: Any) -> list[tuple[Array, Array]]:
 
 
 def _changes(first: Array, second: Array, valid: Array, least: Array) -> Array:
-    """Whether light changes anywhere by what counts as a change; where it does not there is no trust in any flow."""
+    """Whether light changes anywhere by what counts as a change, and not nearly everywhere by much.
+
+    Where nothing changes there is no trust in any flow; and light that is another all over the frame has not moved: it
+    is that of another scene, or was switched.
+    """
     wide = widest(first, second)
-    apart = jnp.square(jnp.mean(first.astype(wide) - second.astype(wide), -1, keepdims=True))
-    return jnp.any(valid & (apart > least))
+    apart = first.astype(wide) - second.astype(wide)
+    changed = jnp.square(jnp.mean(apart, -1, keepdims=True)) > least
+    other = jnp.mean(jnp.square(apart), -1, keepdims=True) > _MUCH
+    shares = [jnp.sum((valid & mask).astype(wide)) for mask in (other, valid)]
+    return jnp.any(valid & changed) & (2 * shares[0] < shares[1])
 
 
 def steps_on(frames: Frames, older: int, newer: int, at: Frame, count: int) -> Float[Array, ""]:
@@ -253,7 +261,7 @@ def light_stages(space: Space | None = None) -> tuple[Stage, ...]:
         reads=(guides_of("history"), "since_oldest.motion"),
         optional=True,
         past=3,
-        needed=Needed("light changes", _light_changes, _unchanged),
+        needed=Needed("light changes, but not all of it", _light_changes, _unchanged),
     )
     flow = Stage(
         "shading flow",
@@ -261,7 +269,7 @@ def light_stages(space: Space | None = None) -> tuple[Stage, ...]:
         takes=("target", "history", "newest", "layers", "motion", "warped", "light_before", "seen", "light_then?"),
         gives=("light", "trust"),
         optional=True,
-        needed=Needed("light changes", _light_changes, _stays),
+        needed=Needed("light changes, but not all of it", _light_changes, _stays),
     )
     return before, then, flow, MOVE
 
@@ -301,7 +309,7 @@ BOTH_TOWARDS = Stage(
     takes=("fetched", "seen", "target", "alpha"),
     gives=("fetched",),
     optional=True,
-    needed=Needed("light changes", _differ, lambda state, values: {"fetched": values["fetched"]}),
+    needed=Needed("light changes, but not all of it", _differ, lambda state, values: {"fetched": values["fetched"]}),
 )
 """Carries the light of both frames to the target's time, each its part of the way from one to the other."""
 
