@@ -270,8 +270,9 @@ def method_case(name: str, size: tuple[int, int]) -> Case:
 
 def method_frames(method: Method, size: tuple[int, int]):
     """Frames of a moving box with every buffer, every other one rendered, seen by a camera that moves."""
-    sequence = []
-    for k in range(9):
+    sequence, past, future = [], 2 * method.past - 1, max(0, 2 * method.future - 1)
+    place = max(5, past)
+    for k in range(place + 4):
         frame = synthetic.make_frame(k, size, fog=0.3)
         full = replace(frame.gbuffer, sky=np.zeros_like(frame.gbuffer.depth), sky_color=frame.color)
         camera = jx.Camera(look(0.02 * k).astype(np.float32), perspective(*size).astype(np.float32))
@@ -279,8 +280,7 @@ def method_frames(method: Method, size: tuple[int, int]):
         full = replace(full, position=full.position - behind)
         frame = replace(frame, gbuffer=full, camera=camera)
         sequence.append(replace(frame if k % 2 == 0 else hide(frame), time=np.float32(k)))
-    past, future = 2 * method.past - 1, max(0, 2 * method.future - 1)
-    return tuple(sequence[5 - past : 5]), sequence[5], tuple(sequence[6 : 6 + future])
+    return tuple(sequence[place - past : place]), sequence[place], tuple(sequence[place + 1 : place + 1 + future])
 
 
 # What may be otherwise

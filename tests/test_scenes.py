@@ -1,5 +1,7 @@
 """The renderer's buffers against each other, and against a float64 NumPy ray caster that shares no code with it."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,8 @@ import pytest
 
 import jaxtrapolate as jx
 from jaxtrapolate.records import check_frame
-from jaxtrapolate.scenes import flow, keyframe, render, visible
+from jaxtrapolate.scenes import flow, keyframe, render, scene_names, visible
+from jaxtrapolate.scenes import scene as named_scene
 from jaxtrapolate.scenes.scene import Builder, Scene, frame_along, material, path, turn, yaw
 from jaxtrapolate.scenes.worlds import common
 
@@ -199,6 +202,17 @@ def test_motion_of_dynamic_surfaces_is_that_of_their_bodies(scene, frame, before
         off = np.abs(there - grid() - frame.motion).max(axis=-1)
         error = np.where(frame.gbuffer.stencil[..., 0] == stencil, np.minimum(error, off), error)
     assert error[frame.gbuffer.stencil[..., 0] > 0].max() < 0.02
+
+
+def test_scenes_have_as_many_object_matrices():
+    """What is compiled for frames of one scene fits those of another."""
+    shapes = set()
+    for name in scene_names():
+        found = jax.eval_shape(
+            partial(render, size=(4, 5), previous_time=0.0), named_scene(name, 1), jnp.float32(1)
+        ).objects
+        shapes |= set() if found is None else {found.shape}
+    assert shapes == {(40, 4, 4)}
 
 
 def test_object_matrices_lead_to_the_frame_before(frame, before):

@@ -298,14 +298,15 @@ def method(name):
 def given(found, *, times=float, dtype=np.float32):
     """What a method sees of a sequence with every buffer, its times numbers of Python or of NumPy."""
     camera, sequence = jx.Camera(eye, eye), []
-    for k in range(9):
+    past, future = 2 * found.past - 1, max(0, 2 * found.future - 1)
+    place = max(5, past)
+    for k in range(place + 4):
         frame = synthetic.make_frame(k, (24, 30))
         sky = np.zeros_like(frame.gbuffer.depth)
         full = replace(frame.gbuffer, sky=sky, sky_color=frame.color)
         frame = in_dtype(replace(frame, gbuffer=full, camera=camera), dtype)
         sequence.append(replace(frame if k % 2 == 0 else hide(frame), time=times(k)))
-    past, future = 2 * found.past - 1, max(0, 2 * found.future - 1)
-    return tuple(sequence[5 - past : 5]), sequence[5], tuple(sequence[6 : 6 + future])
+    return tuple(sequence[place - past : place]), sequence[place], tuple(sequence[place + 1 : place + 1 + future])
 
 
 @pytest.mark.parametrize("name", jx.method_names())

@@ -39,6 +39,7 @@ OPENNESS_HEIGHTS = (0.12, 0.45)
 """Metres above a surface at which the ambient light's occlusion is measured."""
 
 _PACKS = 8
+_OBJECTS = 40  # that matrices are made for at least: as many as the fullest scene has, and a few more
 """Into how many packs the pixels of a frame are divided when reflections are traced, each with its own bounce."""
 
 
@@ -361,8 +362,9 @@ def _render(
 def _object_motion(scene: Scene, poses: tuple[Pose, Pose]) -> Array | None:
     """The map of the world now to that of the previous frame, `[N, 4, 4]`, for the ids 1 to N of the stencil.
 
-    An object of several bodies has that of the first of them, the one that the others hang on. `None` where a scene has
-    no bodies.
+    An object of several bodies has that of the first of them, the one that the others hang on. N is a multiple of
+    `_OBJECTS`, so that what is compiled for one scene fits the others; ids that no object has stand still. `None` where
+    a scene has no bodies.
     """
     if len(scene.bodies.parents) == 1:
         return None
@@ -372,7 +374,9 @@ def _object_motion(scene: Scene, poses: tuple[Pose, Pose]) -> Array | None:
     first = jnp.argmax(ids[None, :] == jnp.arange(1, len(scene.bodies.parents), dtype=ids.dtype)[:, None], axis=1)
     top = jnp.concatenate([moved.rotation[first], moved.translation[first][..., None]], axis=-1)
     last = jnp.broadcast_to(jnp.asarray([0, 0, 0, 1], top.dtype), (*top.shape[:1], 1, 4))
-    return jnp.concatenate([top, last], axis=-2)
+    rows = jnp.concatenate([top, last], axis=-2)
+    more = -len(rows) % _OBJECTS
+    return jnp.concatenate([rows, jnp.broadcast_to(jnp.eye(4, dtype=rows.dtype), (more, 4, 4))])
 
 
 @functools.partial(jax.jit, static_argnames=("size",))
