@@ -106,7 +106,7 @@ def test_rigid_objects_are_followed():
 
 
 def test_holes_are_filled_from_the_newest_frame_that_saw_them():
-    history, target, truth = window(5)
+    history, target, truth = window(3)
     holes = hidden(history, target)
     assert 100 < holes.sum() < 500
     images = [m(history, target) for m in (jx.load("guided_warp"), method())]
@@ -119,7 +119,7 @@ def test_holes_are_filled_from_the_newest_frame_that_saw_them():
 @pytest.mark.slow
 def test_light_that_has_changed_since_is_carried():
     """All light is twice as bright since the last frame: what older frames saw is as well."""
-    history, target, truth = window(5, lambda t: frame(t, light=2.0 if t >= -1 else 1.0))
+    history, target, truth = window(3, lambda t: frame(t, light=2.0 if t >= -1 else 1.0))
     inner = hidden(history, target) & (np.arange(SIZE[1]) < 90)
     followed = method()(history, target)
     ignored = method().replace(relight=1.0)(history, target)

@@ -21,7 +21,7 @@ from jaxtrapolate.errors import printable
 from jaxtrapolate.methods.hindsight import hindsight_stage
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import settings
-from jaxtrapolate.methods.seen import OLDER, Remembered, seen_before_stage
+from jaxtrapolate.methods.seen import Remembered, seen_before_stage
 from jaxtrapolate.methods.shading import Continued, light_stages
 from jaxtrapolate.methods.space import Space, in_space
 from jaxtrapolate.methods.stage import Needed, Stage, Values
@@ -218,7 +218,7 @@ def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
         }
         motions, still = values["motions"], jnp.zeros_like(values["holes"])
         if len(motions) > 1:  # with one rendered frame it is not known whether anything changes
-            still = standing([source.color for source in values["sources"][: len(motions)]], *motions)
+            still = standing([source.color for source in values["sources"]], *motions)
         return {"inputs": inputs, "still": still}
 
     takes = ("target", "layers", "masks", "sources", "motions", "histories", "warped", *COMPOSITE)
@@ -264,7 +264,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
         guided += (*light_stages(preparation.space), seen_before_stage(preparation.space))
 
     def warp(state, values: Values):
-        pairs = zip(values["layers"], values["motions"], strict=False)  # to older ones no motion leads
+        pairs = zip(values["layers"], values["motions"], strict=True)
         warped = tuple(
             in_space(preparation.space, partial(backward_warp, motion=motion, outside=preparation.outside), image)
             for image, motion in pairs
@@ -307,9 +307,9 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
             plain = in_space(preparation.space, partial(composite, values), values["newest"].color)
         return {"image": jnp.where(values["target"].gbuffer.sky > 0.5, plain.astype(image.dtype), image)}
 
-    past, more = max(1, config.histories), OLDER if preparation.first_guess == "shading" else 0
+    past = max(1, config.histories)
     stages = (
-        reproject_stage(past, more=more),
+        reproject_stage(past),
         holes_stage(preparation.taps, position_threshold=preparation.position_threshold),
         dataclasses.replace(OCCLUSION, optional=True),
         *((hindsight_stage(preparation),) if guided else ()),
@@ -336,7 +336,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
         SKY,
     )
     given = _SETTINGS[preparation.first_guess]
-    return Method(name, stages, past=past + more, weights=weights, settings=given, networks={"network": function})
+    return Method(name, stages, past=past, weights=weights, settings=given, networks={"network": function})
 
 
 def first_guess(method: Method) -> Method:

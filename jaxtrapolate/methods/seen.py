@@ -27,9 +27,6 @@ from jaxtrapolate.ops.warp import pixel_grid, sample
 from jaxtrapolate.precision import divide, widest
 from jaxtrapolate.records import Frame, GBuffer, replace
 
-OLDER = 2
-"""Rendered frames beyond the third, the last that light is looked at in, that methods look at for what is hidden."""
-
 _MISSES = 0.25  # pixels: a frame whose positions no camera explains
 _DARKEST = 1e-3  # light under which a ratio says nothing
 

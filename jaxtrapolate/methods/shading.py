@@ -21,7 +21,7 @@ from jaxtrapolate.methods.frames import Frames, rendered
 from jaxtrapolate.methods.hindsight import HINDSIGHT, block_sums, from_blocks
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
-from jaxtrapolate.methods.seen import OLDER, Remembered, seen_before_stage
+from jaxtrapolate.methods.seen import Remembered, seen_before_stage
 from jaxtrapolate.methods.space import Space
 from jaxtrapolate.methods.stage import Needed, Stage, Values
 from jaxtrapolate.methods.stages import (
@@ -278,11 +278,11 @@ def shading_warp() -> Method:
     """The guided warp whose shadows and highlights move on as older frames show, and whose holes older frames fill.
 
     Ours. Light moves on where hindsight agrees; with two rendered frames the flow's own confidence decides, with one it
-    is the guided warp. Up to four older frames are looked at for what is hidden in the newest.
+    is the guided warp. The two older frames are looked at for what is hidden in the newest.
     """
-    first = (reproject_stage(3, more=OLDER), HOLES, HINDSIGHT, demodulate_stage(), guided_stage())
+    first = (reproject_stage(3), HOLES, HINDSIGHT, demodulate_stage(), guided_stage())
     stages = (*first, *light_stages(), seen_before_stage(), modulate_stage(), SKY)
-    return Method("shading_warp", stages, past=3 + OLDER, settings=ShadingSettings())
+    return Method("shading_warp", stages, past=3, settings=ShadingSettings())
 
 
 def _towards(state, values: Values):

@@ -57,13 +57,8 @@ def chain(frames: Sequence[Frame], first: int, last: int, *, before: Array | Non
     return check_present(f"motion from frame {first} to the older frame {last}", total, needed_by="the warp")
 
 
-def reproject_stage(past: int = 1, *, more: int = 0) -> Stage:
-    """Finds the newest `past` rendered frames and the motion that leads to each, as far back as motion vectors go.
-
-    Args:
-        past: how many.
-        more: up to how many older ones "sources" and "layers" hold besides, to which no motion is chained.
-    """
+def reproject_stage(past: int = 1) -> Stage:
+    """Finds the newest `past` rendered frames and the motion that leads to each, as far back as motion vectors go."""
 
     def function(state, values: Values):
         history, target = values["history"], values["target"]
@@ -74,7 +69,6 @@ def reproject_stage(past: int = 1, *, more: int = 0) -> Stage:
             motion, place = chain(frames, place, older, before=motion), older
             sources.append(history[older])
             motions.append(motion)
-        sources += [history[older] for older in rendered(history)[len(sources) : past + more]] if more else []
         return {
             "newest": sources[0],
             "motion": motions[0],
@@ -207,8 +201,7 @@ def holes_stage(taps: Taps = "nearest", **options) -> Stage:
     """Marks where each source shows another surface; with no buffers at all, only what lies outside the frame."""
 
     def function(state, values: Values):
-        # sources to which no motion leads have no mask
-        buffers, pairs = values["target"].gbuffer, zip(values["sources"], values["motions"], strict=False)
+        buffers, pairs = values["target"].gbuffer, zip(values["sources"], values["motions"], strict=True)
         masks = tuple(find_holes(buffers, source.gbuffer, motion, taps=taps, **options) for source, motion in pairs)
         return {"holes": masks[0], "masks": masks}
 

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.frames import rendered
 from jaxtrapolate.methods.hindsight import HINDSIGHT
 from jaxtrapolate.methods.method import Method
@@ -126,8 +127,8 @@ def guides(target, source, motion):
     Of depth it is twice the logarithm, so that it has no unit; the target's is the depth that its surfaces are expected
     to have in the source (`expected_depth`).
     """
-    found = _compared(target, source, motion, _GUIDES)
-    return _compared(target, source, motion, _INSTEAD) if found is None else found
+    found = _compared(target, source, motion, _GUIDES) or _compared(target, source, motion, _INSTEAD)
+    return check_present("albedo, normal, stencil or depth", found, needed_by="the guided warp")
 
 
 def guides_of(role: str) -> str:

@@ -91,8 +91,7 @@ class ExtraNetTask:
         self.options = options
         # preparation looks at the configuration alone
         self._stages = extranet(ExtraNet(options.network, rngs=nnx.Rngs(0)), preparation=options.preparation)
-        # what lies further back only fills holes, and costs as much to render
-        self._windows = Windows(options.windows, self._prepare, past=max(1, options.network.histories))
+        self._windows = Windows(options.windows, self._prepare, past=self._stages.past)
         self._windows.check_sizes()
         self.sequences = self._windows.sequences
         self._validation: Validation | None = None
