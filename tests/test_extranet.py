@@ -374,7 +374,7 @@ def test_ablations_of_the_paper_are_shown_less():
 
 def test_preparations_are_checked():
     for wrong, message in (
-        ({"first_guess": "flow"}, "first_guess: expected one of 'warp', 'guided', got 'flow'"),
+        ({"first_guess": "flow"}, "first_guess: expected one of 'warp', 'guided', 'shading', got 'flow'"),
         ({"by": "light"}, "by: expected one of"),
         ({"outside": 0}, "outside: expected one of"),
         ({"taps": "all"}, "taps: expected one of"),

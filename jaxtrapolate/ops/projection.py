@@ -55,11 +55,11 @@ def fitted_projection(
     inside = known.astype(wide)
     count = jnp.sum(inside)
     center = divide(inside @ points, count)
-    spread = divide(inside @ jnp.sum(jnp.abs(points - center), -1), count, otherwise=1)
+    spread = divide(inside @ jnp.sum(jnp.abs(points - center[None]), -1), count, otherwise=1)
     scale = jnp.where(spread > 0, spread, 1)
     unit = jnp.asarray(max(height, width) / 2, wide)
     middle = jnp.array([(width - 1) / 2, (height - 1) / 2], wide)
-    points = (points - center) / scale
+    points = (points - center[None]) / scale
     u, v = (x - middle[0]) / unit, (y - middle[1]) / unit
     ones, nothing = jnp.ones((len(u), 1), wide), jnp.zeros((len(u), 4), wide)
     here = jnp.concatenate([points, ones], -1)
@@ -113,7 +113,8 @@ def project(matrix: Float[Array, "3 4"], position: Float[Array, "h w 3"]) -> Flo
     finite = jnp.all(jnp.isfinite(position), -1, keepdims=True)
     held = jnp.where(finite, position, 0)
     # not a matrix product, which some GPUs take in fewer bits
-    seen = jnp.sum(held[..., None, :] * matrix[:, :3].astype(held.dtype), -1) + matrix[:, 3].astype(held.dtype)
+    rows = matrix.astype(held.dtype)[None, None]
+    seen = jnp.sum(held[..., None, :] * rows[..., :3], -1) + rows[..., 3]
     along = seen[..., 2:]
     return jnp.where(finite & (along > 0), divide(seen[..., :2], along), jnp.nan)
 

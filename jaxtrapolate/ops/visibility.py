@@ -89,8 +89,8 @@ def expected_depth(
     target, seen = ratio.reshape(-1) - 1, seen.reshape(-1)
 
     def improve(_, coefficients):
-        off = jnp.abs(jnp.sum(features * coefficients, -1) - target)
-        typical = jnp.nanmedian(jnp.where(seen, off, jnp.nan))
+        off = jnp.abs(jnp.sum(features * coefficients[None, :], -1) - target)
+        typical = jnp.nanquantile(jnp.where(seen, off, jnp.nan), jnp.asarray(0.5, wide))  # nanmedian takes float64
         typical = jnp.where(typical > 1e-4, typical, 1e-4)  # also where nothing is seen: NaN
         weight = jnp.where(seen, 1 / jnp.square(1 + jnp.square(off / (2 * typical))), 0)
         # a pull towards no change decides what the frame leaves open: all at one depth, or nothing there
