@@ -52,9 +52,9 @@ def _best(columns: Sequence[Sequence[float]], digits: int = 2) -> list[list[str]
     ]
 
 
-def by_scene(names: Sequence[str]) -> str:
+def by_scene(names: Sequence[str], run: str = "test_seeds") -> str:
     """dB of methods on the test seeds, the mean over each scene's and over all."""
-    found = read("experiments/results/evaluated/test_seeds.json")
+    found = read(f"experiments/results/evaluated/{run}.json")
     inputs: dict[str, list[dict[str, Any]]] = {}
     for entry in found["inputs"]:
         if any(methods["psnr"] == "inf" for methods in entry["methods"].values()):
@@ -66,9 +66,9 @@ def by_scene(names: Sequence[str]) -> str:
     return table(["dB", *inputs, "mean"], [list(row) for row in rows])
 
 
-def by_cause(names: Sequence[str]) -> str:
+def by_cause(names: Sequence[str], run: str = "test_seeds") -> str:
     """dB of methods on the test seeds by cause."""
-    found = read("experiments/results/evaluated/test_seeds.json")["methods"]
+    found = read(f"experiments/results/evaluated/{run}.json")["methods"]
     causes = {cause: entry["share"] for cause, entry in found[names[0]]["by_cause"].items()}
     columns = [[found[name]["by_cause"][cause]["psnr"] for name in names] for cause in causes]
     head = [f"{cause} {100 * share:.1f} %" for cause, share in causes.items()]
@@ -78,6 +78,10 @@ def by_cause(names: Sequence[str]) -> str:
 _RENAMED = {"extranet": "guided_net"}
 
 _MEASURED = {"czest1dm": "path-traced map", "torcs": "cars", "bunker": "engine clip"}
+
+
+LIGHT = ("guided_warp", "shading_warp", "bidirectional_guided", "bidirectional_shading")
+"""Methods without and with the light's own motion."""
 
 
 def both_sides() -> str:
@@ -114,6 +118,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "test-causes": partial(by_cause, PAST),
     "test-causes-both": partial(by_cause, BOTH),
     "both-sides": both_sides,
+    "light": partial(by_scene, LIGHT, "test_seeds_light"),
+    "light-causes": partial(by_cause, LIGHT, "test_seeds_light"),
     "before": before,
 }
 """Each by its name in the pages."""
