@@ -49,7 +49,7 @@ _LOGARITHM = 10.0  # of the depth as a guide: 10 % of the depth is one sigma
 
 @settings
 class FlowOfLight:
-    """Of the flow of light; measured in experiments/shading_warp.py."""
+    """Of the flow of light."""
 
     least_gain: float = option(0.1, "share of the change of light that its flow must explain", low=0, high=1)
     least_change: float = option(3e-5, "squared change of light, after a tone curve, that counts as one", low=0)
