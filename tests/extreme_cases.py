@@ -163,6 +163,7 @@ _KINDS: dict[str, tuple[str, ...]] = {
     "psnr": ("color", "color", ""),
     "psnr-mask": ("color", "color", "mask"),
     "relative_loss": ("color", "color", "color"),
+    "temporal_loss": ("color", "color", "mask"),
     "splat": ("color", "motion"),
     "splat-linear": ("color", "motion", "weight"),
     "splat-softmax": ("color", "motion", "weight"),
@@ -326,7 +327,8 @@ LISTED = {(name, row): reason for reason, cases in _REASONS.items() for name, ro
 """By case and row: why value or gradient is not finite there."""
 
 MEANS = ("mse", "psnr", "ssim", "l1_loss", "charbonnier_loss", "hole_loss", "shading_loss", "extranet_loss")
-MEANS += ("relative_loss",)
+MEANS += ("relative_loss", "census_loss", "feature_census_loss", "feature_difference_loss", "slope_loss")
+MEANS += ("temporal_loss",)
 """One number of all pixels: what is not a number in one of them is seen in it."""
 
 REACHES = {"": 4}

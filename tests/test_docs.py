@@ -21,6 +21,7 @@ PAGES = [
 ]
 SLOW = {"README.md", "docs/index.md"}  # their examples render a scene
 MODULES = ("files", "metrics", "scenes", "latency", "networks", "weights", "training", "training/losses.py")
+MODULES += ("training/extrass_losses.py",)
 
 
 def name_of(page):

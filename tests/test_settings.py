@@ -39,7 +39,7 @@ from jaxtrapolate.records import replace
 from jaxtrapolate.scenes.scene import Builder, material, path
 from jaxtrapolate.scenes.shading import lamp_levels
 from jaxtrapolate.scenes.worlds import common
-from jaxtrapolate.training import Config, Optimizer, losses
+from jaxtrapolate.training import Config, Optimizer, extrass_losses, losses
 from jaxtrapolate.training.step import make_step
 from jaxtrapolate.training.tasks import round_key
 
@@ -166,6 +166,11 @@ MORE = {
     "extranet_loss": (jax.grad(lambda *a: losses.extranet_loss(*a)[0]), image, image, stencil),
     "extranet_loss-paper": (lambda *a: losses.extranet_loss(*a, shade="paper"), image, image, stencil),
     "relative_loss": (losses.relative_loss, image, image, image),
+    "census_loss": (lambda a, b: extrass_losses.census_loss(a, b, size=3), image, image),
+    "feature_census_loss": (lambda a, b: extrass_losses.feature_census_loss([a], [b]), image, image[::-1]),
+    "feature_difference_loss": (lambda a, b: extrass_losses.feature_difference_loss([a], [b]), image, image[::-1]),
+    "slope_loss": (extrass_losses.slope_loss, image, image),
+    "temporal_loss": (extrass_losses.temporal_loss, image, image, stencil),
     "splat_nearest-one": (lambda v, m, d: jx.splat_nearest(v, m, d, footprint=1), image, motion, depth),
     "backward_warp-zero": (lambda i, m: jx.backward_warp(i, m, outside="zero"), image, motion),
 }
@@ -184,7 +189,7 @@ def test_the_list_has_every_public_function():
         "replace",
     }
     assert {name for name in test_api.FUNCTIONS if "." not in name} <= names
-    for module in (radiance, metrics, losses, fill):
+    for module in (radiance, metrics, losses, extrass_losses, fill):
         public = {n for n, v in vars(module).items() if callable(v) and getattr(v, "__module__", "") == module.__name__}
         named = {
             "check_mask",
@@ -193,6 +198,7 @@ def test_the_list_has_every_public_function():
             "covered_around",
             "extranet_loss",
             "hole_loss",
+            "perceptual_loss",
             "shading_loss",
             "ssim_map",
             "Metric",
