@@ -11,8 +11,7 @@ from oracles import random
 
 import jaxtrapolate as jx
 from jaxtrapolate.networks import Interpolator, InterpolatorConfig, inference
-from jaxtrapolate.networks.blocks import pixel_shuffle, upsample_2x
-from jaxtrapolate.networks.interpolator import _warp
+from jaxtrapolate.networks.blocks import pixel_shuffle, upsample_2x, warp
 
 SMALL = InterpolatorConfig(widths=(4, 6))
 
@@ -63,7 +62,7 @@ def test_double_and_shuffle_against_loops(size):
 
 def test_the_warp_is_the_librarys():
     image, motion = jnp.asarray(random(2, 5, 7, 3)), jnp.asarray(random(2, 5, 7, 2, low=-3, high=3, seed=1))
-    np.testing.assert_allclose(_warp(image, motion), jax.vmap(jx.backward_warp)(image, motion), atol=1e-6)
+    np.testing.assert_allclose(warp(image, motion), jax.vmap(jx.backward_warp)(image, motion), atol=1e-6)
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ Convention:
 """
 
 import math
+import operator
 from typing import Literal, cast, get_args
 
 import jax
@@ -15,6 +16,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_choice
+from jaxtrapolate.ops.warp import landing, sample
 from jaxtrapolate.precision import widest
 
 Gate = Literal["none", "light", "full"]
@@ -194,11 +196,26 @@ def upsample_2x(x: Float[Array, "b h w c"], *, aligned: bool = True) -> Float[Ar
     return _upsample_axis_2x(_upsample_axis_2x(x, 1, aligned), 2, aligned)
 
 
-def pixel_shuffle(x: Float[Array, "b h w c"]) -> Float[Array, "b i j d"]:
-    """Twice the height and width, a quarter of the channels: each pixel's quarters become 2 x 2 pixels, row by row."""
+def pixel_shuffle(x: Float[Array, "b h w c"], factor: int = 2) -> Float[Array, "b i j d"]:
+    """`factor` times the height and width, of so many channels less: each pixel's parts become pixels, row by row."""
     batch, height, width, channels = x.shape
-    x = x.reshape(batch, height, width, 2, 2, channels // 4)
-    return x.transpose(0, 1, 3, 2, 4, 5).reshape(batch, 2 * height, 2 * width, channels // 4)
+    left = channels // factor**2
+    x = x.reshape(batch, height, width, factor, factor, left)
+    return x.transpose(0, 1, 3, 2, 4, 5).reshape(batch, factor * height, factor * width, left)
+
+
+def pixel_unshuffle(x: Float[Array, "b i j d"], factor: int = 2) -> Float[Array, "b h w c"]:
+    """What `pixel_shuffle` makes an image of: height and width, multiples of `factor`, divided by it."""
+    batch, height, width, channels = x.shape
+    x = x.reshape(batch, height // factor, factor, width // factor, factor, channels)
+    return x.transpose(0, 1, 3, 2, 4, 5).reshape(batch, height // factor, width // factor, factor**2 * channels)
+
+
+@jax.vmap
+def warp(image, motion):
+    """`backward_warp` for an image that is known to be finite: mapped, that one would compute both of its cases."""
+    x, y, _ = landing(motion)
+    return sample(image, x, y, product=operator.mul)  # type: ignore[arg-type]
 
 
 def pad_to_multiple(x: Float[Array, "b h w c"], multiple: int) -> Float[Array, "b i j c"]:

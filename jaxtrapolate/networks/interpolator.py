@@ -9,7 +9,6 @@ residual is held within what the two warped frames differ by (`explained`).
 """
 
 import dataclasses
-import operator
 from functools import partial
 from itertools import pairwise
 
@@ -19,9 +18,8 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_array
-from jaxtrapolate.networks.blocks import HE, Layer, pad_to_multiple, pixel_shuffle, upsample_2x
+from jaxtrapolate.networks.blocks import HE, Layer, pad_to_multiple, pixel_shuffle, upsample_2x, warp
 from jaxtrapolate.networks.explained import explained
-from jaxtrapolate.ops.warp import landing, sample
 from jaxtrapolate.precision import widest
 
 
@@ -41,28 +39,22 @@ class InterpolatorConfig:
         return 2 ** len(self.widths)
 
 
-_layer = partial(Layer, norm=False, activation="prelu", gain=HE)
+prelu_layer = partial(Layer, norm=False, activation="prelu", gain=HE)
+"""What these networks are built of."""
 
 
 class Decoder(nnx.Module):
     """What one level predicts for the next finer one: `[B, 2h, 2w, outputs]`."""
 
     def __init__(self, inputs: int, width: int, outputs: int, *, rngs: nnx.Rngs):
-        self.join = _layer(inputs, width, rngs=rngs)
-        self.refine = nnx.Sequential(_layer(width, width, rngs=rngs), _layer(width, width, rngs=rngs))
+        self.join = prelu_layer(inputs, width, rngs=rngs)
+        self.refine = nnx.Sequential(prelu_layer(width, width, rngs=rngs), prelu_layer(width, width, rngs=rngs))
         # small at first, so that training sets out from about the linear blend
         self.head = Layer(width, 4 * outputs, norm=False, activation="none", gain=0.05, rngs=rngs)
 
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b i j d"]:
         hidden = self.join(x)
         return pixel_shuffle(self.head(hidden + self.refine(hidden)))
-
-
-@jax.vmap
-def _warp(image, motion):
-    """`backward_warp` for an image that is known to be finite: mapped, that one would compute both of its cases."""
-    x, y, _ = landing(motion)
-    return sample(image, x, y, product=operator.mul)  # type: ignore[arg-type]
 
 
 class Interpolator(nnx.Module):
@@ -82,8 +74,8 @@ class Interpolator(nnx.Module):
         self.config = config
         self.encoder = nnx.List([])
         for before, after in pairwise((3, *widths)):
-            down = _layer(before, after, stride=2, rngs=rngs)
-            self.encoder.append(nnx.Sequential(down, _layer(after, after, rngs=rngs)))
+            down = prelu_layer(before, after, stride=2, rngs=rngs)
+            self.encoder.append(nnx.Sequential(down, prelu_layer(after, after, rngs=rngs)))
         self.decoders = nnx.List([])
         for width, finer in pairwise((*widths[::-1], 4)):  # at last a mask and a residual
             inputs = 3 * width + 4 if self.decoders else 2 * width + 1
@@ -133,7 +125,7 @@ class Interpolator(nnx.Module):
 
         def fetch(pair, flow):
             a, b = split(pair)
-            return _warp(a, later * flow[..., :2]), _warp(b, earlier * flow[..., 2:])
+            return warp(a, later * flow[..., :2]), warp(b, earlier * flow[..., 2:])
 
         def join(*parts):
             return jnp.concatenate([part.astype(value.dtype) for part in parts], -1)
