@@ -419,7 +419,17 @@ def test_a_missing_package_is_named(monkeypatch, extra):
 
 
 def test_metrics_by_name():
-    assert metrics.metric_names() == ("psnr", "ssim", "flip", "flip_hdr", "lpips", "lpips_vgg", "vmaf", "xpsnr")
+    assert metrics.metric_names() == (
+        "psnr",
+        "ssim",
+        "flip",
+        "flip_hdr",
+        "lpips",
+        "lpips_vgg",
+        "vmaf",
+        "xpsnr",
+        "flicker",
+    )
     first, second = pair(17, 23)
     mask = random(17, 23, 1, seed=4) > 0.4
     for name, function in metrics.METRICS.items():

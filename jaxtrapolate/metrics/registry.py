@@ -8,7 +8,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 
 from jaxtrapolate.checks import check_choice, check_installed
-from jaxtrapolate.metrics import perceptual
+from jaxtrapolate.metrics import perceptual, temporal
 from jaxtrapolate.metrics.image import check_pair, counted, psnr, ssim
 
 METRICS = {"psnr": psnr, "ssim": ssim}
@@ -68,6 +68,7 @@ _ALL = {
         (Metric("lpips_vgg", partial(perceptual.lpips, net="vgg")), "lpips"),
         (Metric("vmaf", perceptual.vmaf, per="clip", better="higher"), "vmaf"),
         (Metric("xpsnr", perceptual.xpsnr, per="clip", better="higher", unit="dB"), "vmaf"),
+        (Metric("flicker", temporal.flicker, per="clip"), None),
     )
 }
 
@@ -81,8 +82,9 @@ def load(name: str) -> Metric:
     """A metric by name: `load("flip")(generated, truth)` is a float.
 
     Args:
-        name: "psnr", "ssim"; "flip" (LDR), "flip_hdr"; "lpips" (AlexNet), "lpips_vgg"; "vmaf", "xpsnr" (clips). All
-            compare display values in 0..1 but "flip_hdr", which takes linear radiance: see `Metric.space`.
+        name: "psnr", "ssim"; "flip" (LDR), "flip_hdr"; "lpips" (AlexNet), "lpips_vgg"; "vmaf", "xpsnr",
+            "flicker" (clips). All compare display values in 0..1 but "flip_hdr", which takes linear radiance: see
+            `Metric.space`.
 
     Raises:
         ValueError: an unknown name.
