@@ -9,7 +9,11 @@ from flax import nnx
 import jaxtrapolate as jx
 from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.methods.extranet import extranet
+from jaxtrapolate.methods.extrass import extrass_refine
+from jaxtrapolate.methods.extrass_joint import extrass
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
+from jaxtrapolate.networks.extrass import ExtraSS, ExtraSSConfig, ExtraSSNetConfig
+from jaxtrapolate.networks.frnet import FRNet, FRNetConfig
 
 SMALL = ExtraNetConfig(widths=(4, 6))
 SIZE = (9, 13)
@@ -62,8 +66,15 @@ def random_model(config, build=ExtraNet):
 
 
 def load(name):
-    """A method by name; "extranet", which has no default weights, with random ones."""
-    return extranet(random_model(SMALL)) if name == "extranet" else jx.load(name)
+    """A method by name; those without default weights with small networks of random ones."""
+    if name == "extranet":
+        return extranet(random_model(SMALL))
+    if name == "extrass_refine":
+        return extrass_refine(random_model(FRNetConfig(widths=(4, 6)), FRNet))
+    if name == "extrass":
+        sampler = ExtraSSNetConfig(widths=(4, 6), bottleneck=8)
+        return extrass(random_model(ExtraSSConfig(FRNetConfig(widths=(4, 6)), sampler), ExtraSS))
+    return jx.load(name)
 
 
 def image_of(method, history, target):

@@ -21,7 +21,7 @@ from jaxtrapolate.records import replace
 
 SIZE = (16, 24)
 
-NETWORKS = ("guided_net", "extranet", "interpolator")
+NETWORKS = ("guided_net", "extranet", "extrass_refine", "extrass", "interpolator")
 
 
 def window(size=SIZE):
@@ -230,7 +230,8 @@ def test_every_method_in_bfloat16(unchecked, name, strict):
         history, target, future = between()
     else:
         (history, target, _), future = window(), ()
-    image = jax.eval_shape(lambda state: method.function(state, (), history, target, future)[1], method.state)
+    carry = method.init(history, target)
+    image = jax.eval_shape(lambda state: method.function(state, carry, history, target, future)[1], method.state)
     assert image.dtype == np.float32
 
 

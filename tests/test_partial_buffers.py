@@ -16,7 +16,7 @@ from jaxtrapolate.records import CHANNELS, Camera, Frame, GBuffer, Keyframe
 
 SIZE = (8, 12)
 NAMES = sorted(jx.method_names())
-NETWORKS = ("guided_net", "extranet", "interpolator")
+NETWORKS = ("guided_net", "extranet", "extrass_refine", "extrass", "interpolator")
 BUFFERS = ("albedo", "depth", "normal", "position", "specular", "metallic", "stencil", "sky", "sky_color")
 
 load = functools.cache(small_extranet.load)
@@ -41,7 +41,10 @@ def frame(color, names, *, empty=False):
 
 def made(method, history, target, future):
     """The shape of a method's image, traced and not computed."""
-    function = lambda *frames: method.function(method.state, (), *frames)[1]  # noqa: E731
+
+    def function(history, target, future):
+        return method.function(method.state, method.init(history, target), history, target, future)[1]
+
     return jax.eval_shape(function, history, target, future)
 
 
@@ -53,10 +56,11 @@ def runs_or_says_why(method, history, target, future):
         expected: list = []
         for stage in method.stages:
             given = {name for before in expected for name in before.gives}
-            if stage.name not in missing and not (stage.fallback and given >= set(stage.gives)):
+            skipped = stage.on == "rendered" or (stage.fallback and given >= set(stage.gives))
+            if stage.name not in missing and not skipped:
                 expected.append(stage)
         assert list(method.active(history, target, future)) == expected
-        assert made(method, history, target, future).shape == (*SIZE, 3)
+        assert made(method, history, target, future).shape == (*(method.scale * n for n in SIZE), 3)
         return True
     with pytest.raises(ValueError, match=r"missing|frame with colour") as raised:
         made(method, history, target, future)

@@ -298,7 +298,7 @@ def method(name):
         return {"guided_net": guided_net, "extranet": extranet}[name](small_extranet.random_model(config))
     if name == "interpolator":
         return interpolator(small_extranet.random_model(InterpolatorConfig(widths=(4, 6)), Interpolator))
-    return jx.load(name)
+    return small_extranet.load(name)
 
 
 def given(found, *, times=float, dtype=np.float32):
@@ -321,8 +321,8 @@ def test_methods_keep_float32(unchecked, name):
     found = method(name)
     arguments = given(found, times=np.float64)
 
-    def function(state, *arguments):
-        return found.function(state, (), *arguments)[1]
+    def function(state, history, target, future):
+        return found.function(state, found.init(history, target), history, target, future)[1]
 
     with all_settings():
         result = jax.eval_shape(function, found.state, *arguments)
@@ -337,8 +337,12 @@ def test_methods_in_other_precisions(unchecked, name, dtype):
     """A network answers in at least float32, all else in the precision of the frames."""
     found = method(name)
     arguments = given(found, dtype=jnp.dtype(dtype))
-    result = kinds(lambda state, *a: found.function(state, (), *a)[1], found.state, *arguments)
-    assert result == {"float32" if name in ("guided_net", "extranet") and dtype != "float64" else dtype}
+
+    def function(state, history, target, future):
+        return found.function(state, found.init(history, target), history, target, future)[1]
+
+    result = kinds(function, found.state, *arguments)
+    assert result == {"float32" if name in ("guided_net", "extranet", "extrass") and dtype != "float64" else dtype}
 
 
 # Scenes

@@ -36,7 +36,7 @@ from jaxtrapolate.evaluation.score import DEFAULT_METRICS
 from jaxtrapolate.evaluation.video import write_evaluation_video
 from jaxtrapolate.evaluation.windows import load
 from jaxtrapolate.files import Sequence
-from jaxtrapolate.methods import Method, default_methods, method_names
+from jaxtrapolate.methods import ON_REQUEST, Method, default_methods, method_names
 from jaxtrapolate.metrics import Metric, metric_names
 from jaxtrapolate.metrics import load as load_metric
 from jaxtrapolate.report import write_report
@@ -58,7 +58,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--methods",
         metavar="A,B,C",
-        help=f"separated by commas, of {', '.join(method_names())} (all but extranet that can run)",
+        help=f"separated by commas, of {', '.join(method_names())} ({', '.join(ON_REQUEST)} only where named)",
     )
     add_weights(parser)
     parser.add_argument("--output", required=True, metavar="DIR", help="for results.json, report.html and pictures")

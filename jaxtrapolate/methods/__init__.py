@@ -11,12 +11,15 @@ from jaxtrapolate.methods import (
     bidirectional,
     blending,
     extranet,
+    extrass,
+    extrass_joint,
     grids,
     guided_net,
     interpolator,
     opticalflow,
     reprojection,
     shading,
+    upsampling,
     warping,
 )
 from jaxtrapolate.methods.frames import neighbours as neighbours
@@ -31,6 +34,7 @@ _METHODS: dict[str, Callable[[], Method]] = {
     "warp": warping.warp,
     "occlusion_warp": warping.occlusion_warp,
     "guided_warp": warping.guided,
+    "extrass_warp": extrass.extrass_warp,
     "shading_warp": shading.shading_warp,
     "blend": blending.blend,
     "reproject": reprojection.reprojection,
@@ -44,12 +48,19 @@ _METHODS: dict[str, Callable[[], Method]] = {
     "bidirectional": bidirectional.bidirectional,
     "bidirectional_guided": bidirectional.bidirectional_guided,
     "bidirectional_shading": shading.bidirectional_shading,
+    "bilinear": upsampling.bilinear,
+    "bicubic": upsampling.bicubic,
+    "easu": upsampling.easu,
+    "taa": upsampling.taa,
+    "taau": upsampling.taau,
 }
 
 
 _NETWORKS: dict[str, Callable[[str | PathLike[str]], Method]] = {
     "guided_net": guided_net.load,
     "extranet": extranet.load,
+    "extrass_refine": extrass.load_refine,
+    "extrass": extrass_joint.load,
     "interpolator": interpolator.load,
 }
 """Methods with weights, each built from a file of them."""
@@ -58,6 +69,8 @@ _NETWORKS: dict[str, Callable[[str | PathLike[str]], Method]] = {
 _DESCRIBED: dict[str, Callable[..., Method]] = _METHODS | {
     "guided_net": guided_net.guided_net,
     "extranet": extranet.extranet,
+    "extrass_refine": extrass.extrass_refine,
+    "extrass": extrass_joint.extrass,
     "interpolator": interpolator.interpolator,
 }
 
@@ -66,6 +79,9 @@ BEST_FIRST = (
     *("bidirectional_image", "interpolator", "occlusion_warp", "softmax_splat", "dis", "warp", "blend", "repeat"),
 )
 """Methods by what they have been worth on embedded scenes: what is used where none is named is the first that can."""
+
+ON_REQUEST = (extranet.NAME, extrass.WARP_NAME, extrass.REFINE_NAME, extrass_joint.NAME, *upsampling.NAMES)
+"""The papers' own forms of `guided_net` and `guided_warp`, what has no default weights, and what super samples."""
 
 ENTRY_POINTS = "jaxtrapolate.methods"
 """The group of entry points by which other packages add methods, see `load`."""
@@ -83,8 +99,8 @@ def method_names() -> tuple[str, ...]:
 
 
 def default_methods() -> tuple[str, ...]:
-    """The methods that are tried where none is named: all but the paper's network, of which `guided_net` is ours."""
-    return tuple(name for name in method_names() if name != extranet.NAME)
+    """The methods that are tried where none is named: all but `ON_REQUEST`."""
+    return tuple(name for name in method_names() if name not in ON_REQUEST)
 
 
 def method_description(name: str) -> str:

@@ -27,7 +27,7 @@ def _values(name: str, frames: Frames) -> Iterator[np.ndarray]:
         values = np.asarray(frame)
         values = np.float32(values) / 255 if values.dtype == np.uint8 else np.asarray(values)
         size = check_image(f"{name}[{k}]", values, size=size, channels=3)
-        yield np.float32(values)
+        yield values.astype(np.float32)
 
 
 def _score(name: str, values: list[float]) -> ClipScore:

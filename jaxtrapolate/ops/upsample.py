@@ -34,12 +34,13 @@ def upsampled_places(size: Size, scale: int | float, jitter: ArrayLike | None, d
     return jnp.broadcast_to(x[None, :], larger), jnp.broadcast_to(y[:, None], larger)
 
 
-def _checked(image, scale, jitter):
-    check_image("image", image)
+def _checked(image, scale, jitter) -> Size:
+    size = check_image("image", image)
     if jitter is not None:
         check_array("jitter", jitter, shape=(2,))
     if not 0 < scale < float("inf"):
         raise ValueError(f"scale: expected a positive number, got {scale}")
+    return size
 
 
 @partial(jax.jit, static_argnames=("scale", "filter"))
@@ -68,10 +69,10 @@ def upsample(
         TypeError, ValueError: no floating-point image, a jitter of another shape, a `scale` that is not positive, or an
             unknown filter.
     """
-    _checked(image, scale, jitter)
+    size = _checked(image, scale, jitter)
     check_choice("filter", filter, get_args(Filter))
     image = jnp.asarray(image)
-    x, y = upsampled_places(image.shape[:2], scale, jitter, widest(image))
+    x, y = upsampled_places(size, scale, jitter, widest(image))
 
     def fetch(product, image, places):
         return sample(image, *places, filter=filter, product=product)
@@ -132,10 +133,9 @@ def easu(
         AMD FidelityFX Super Resolution 1.0, the pass EASU as published (`FsrEasuF`), with exact reciprocals and square
         roots where that has approximate ones. Its second pass, sharpening (RCAS), is left out.
     """
-    _checked(image, scale, jitter)
+    height, width = _checked(image, scale, jitter)
     image = jnp.asarray(image)
     check_image("image", image, channels=3)
-    height, width, _ = image.shape
     wide = widest(image)
     x, y = upsampled_places((height, width), scale, jitter, wide)
     column, row = jnp.floor(x), jnp.floor(y)

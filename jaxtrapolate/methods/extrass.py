@@ -1,0 +1,326 @@
+"""ExtraSS at the input's resolution (Wu et al. 2023): the guided warp, and its shading refined by FRNet at half size.
+
+Half size is every other pixel of every other row, of colours and buffers alike: pixel p of it is pixel 2p, and motion
+there is half as long. Upsampled, each stands for the 2 x 2 pixels from there on (the paper's nearest upsampling).
+
+Values passed on: "inputs", what FRNet is shown, and "refined", what it has made of it, both at half size; "moves",
+bool, whether it was asked at all.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from os import PathLike
+from typing import Any, Literal, get_args
+
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Float
+
+from jaxtrapolate.checks import check_choice
+from jaxtrapolate.methods.method import Method
+from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.space import Space, space
+from jaxtrapolate.methods.stage import Needed, Stage, Values
+from jaxtrapolate.methods.stages import (
+    HOLES,
+    REPROJECT,
+    SKY,
+    demodulate_stage,
+    find_holes,
+    modulate_stage,
+    reflecting,
+    reproject_stage,
+)
+from jaxtrapolate.methods.warping import Guide, fetch_guided, guided_stage, guides_of
+from jaxtrapolate.networks.frnet import FRNet, FRNetConfig, Refined
+from jaxtrapolate.networks.inference import inference
+from jaxtrapolate.networks.stored import load_network
+from jaxtrapolate.ops.radiance import By, compress, demodulate, expand, log_decode, log_encode, modulate
+from jaxtrapolate.precision import divide, widest
+from jaxtrapolate.records import GBuffer
+from jaxtrapolate.weights import configured
+
+WARP_NAME, REFINE_NAME = "extrass_warp", "extrass_refine"
+
+Curve = Literal["tone", "log"]
+
+
+@settings
+class ExtraSSWarp(Guide):
+    """Of the guided warp as the paper has it, demodulated by the base colour alone."""
+
+    by: By = option("albedo", "what the colour is divided by before it is warped", choices=By)
+    floor: float = option(0.01, "the smallest divisor", low=0, high=1)
+    sky: bool = option(True, "whether the sky's colour is warped undivided; else its albedo counts")
+    space: Space = space()
+
+
+def extrass_warp() -> Method:
+    """The guided warp alone, demodulated by the base colour (ExtraSS, "Ours-W").
+
+    `guided_warp` without what is ours in it: hindsight, the material's specular part in the divisor, and bilinear
+    fetching where all guides agree.
+
+    References:
+        Wu et al. 2023 (ExtraSS), section 4.2. Departures: the widths of the Gaussians, which are those of
+        `guided_warp`, and `far_motion` before it, in frames of 360 rows or more (`rows`).
+    """
+    stages = (REPROJECT, HOLES, demodulate_stage(), guided_stage(), modulate_stage(), SKY)
+    return Method(WARP_NAME, stages, settings=ExtraSSWarp())
+
+
+@dataclasses.dataclass(frozen=True)
+class Refinement:
+    """How frames are prepared for FRNet; a part of its weights.
+
+    Attributes:
+        by, floor: of `demodulate`, before every warp.
+        sky: whether the sky's colour is fed undivided; else demodulated like the rest, by the albedo stored there.
+        modulated: whether FRNet is shown colours, as in the paper; else light, which the target's own reflectance at
+            full size makes a colour again.
+        curve: in which values it sees them: "tone", `compress`, or "log", `log_encode`.
+        space: in which colours are fetched between pixels.
+    """
+
+    by: By = "albedo"
+    floor: float = 1e-2
+    sky: bool = True
+    modulated: bool = True
+    curve: Curve = "tone"
+    space: Space = "tone"
+
+    def __post_init__(self) -> None:
+        for name, choices in (("by", By), ("curve", Curve), ("space", Space)):
+            check_choice(name, getattr(self, name), get_args(choices))
+        if not 0 <= self.floor < float("inf"):
+            raise ValueError(f"floor: expected 0 or more, got {self.floor!r}")
+
+    def encode(self, image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
+        """Light as FRNet sees it, in at least float32; what is negative or NaN counts as 0."""
+        image = image.astype(widest(image))
+        return compress(image) if self.curve == "tone" else log_encode(jnp.where(jnp.isfinite(image), image, 0))
+
+    def decode(self, image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
+        """The inverse of `encode`."""
+        return expand(image) if self.curve == "tone" else log_decode(image)
+
+
+@settings
+class Blend(Guide):
+    """Where FRNet's light is taken, and of the guided warps."""
+
+    similar: float = option(0.1, "how much alike the surfaces of both sizes have to be at least", low=-1, high=1)
+    changed: float = option(0.1, "relative difference to the guided warp from which on light is taken", low=0)
+    softness: float = option(0.0, "half width of the steps at both thresholds", low=0, high=1)
+    least: float = option(0.001, "brightness below which differences are no longer relative", low=1e-30)
+
+
+def half(image: Float[Array, "h w c"]) -> Float[Array, "i j c"]:
+    """Every other pixel of every other row: `[ceil(H / 2), ceil(W / 2), C]`."""
+    return image[::2, ::2]
+
+
+def doubled(image: Float[Array, "i j c"], like: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
+    """Each pixel of a halved image for those that it stands for, at the size of the whole one."""
+    height, width = like.shape[:2]
+    return jnp.repeat(jnp.repeat(image, 2, 0), 2, 1)[:height, :width]
+
+
+def halved(buffers: GBuffer | None) -> GBuffer:
+    """Buffers at half size."""
+    given = {field.name: getattr(buffers or GBuffer(), field.name) for field in dataclasses.fields(GBuffer)}
+    return GBuffer(**{name: None if value is None else half(jnp.asarray(value)) for name, value in given.items()})
+
+
+def _step(x: Array, softness: Array) -> Array:
+    """0 below -softness, 1 from there on above, straight between; with softness 0 whether x is over 0."""
+    soft = softness > 0
+    return jnp.where(soft, jnp.clip((x / jnp.where(soft, softness, 1) + 1) / 2, 0, 1), jnp.where(x > 0, 1, 0))
+
+
+def blend_mask(
+    light: Float[Array, "h w 3"], warped: Float[Array, "h w 3"], buffers: GBuffer | None, how: Any
+) -> Float[Array, "h w 1"]:
+    """How much of the refined light is taken at each pixel, in 0..1.
+
+    Where the surface at half size is like the pixel's own, and where that light differs from the warped frame's: at the
+    sky never, nor where either is not finite.
+
+    Args:
+        light: `[H, W, 3]`, refined at half size and doubled.
+        warped: `[H, W, 3]`, by the guided warp at full size.
+        buffers: of the target; albedo and normal that are absent count as alike.
+        how: a `Blend`.
+
+    References:
+        Wu et al. 2023 (ExtraSS), eq. 6, with the sum of the channels' differences for its norm. Ours are `softness`,
+        `least` and the sky.
+    """
+    buffers = buffers or GBuffer()
+    similar, changed, softness, least = (
+        jnp.asarray(v, light.dtype) for v in (how.similar, how.changed, how.softness, how.least)
+    )
+    known = jnp.all(jnp.isfinite(light) & jnp.isfinite(warped), -1, keepdims=True)
+    light, warped = (jnp.where(known, a, 0).astype(light.dtype) for a in (light, warped))
+    alike = jnp.ones_like(light[..., :1])
+    if buffers.albedo is not None:
+        albedo = jnp.asarray(buffers.albedo, light.dtype)
+        apart = jnp.sum(jnp.square(doubled(half(albedo), albedo) - albedo), -1, keepdims=True)
+        alike -= jnp.sqrt(apart / 3)
+    if buffers.normal is not None:
+        normal = jnp.asarray(buffers.normal, light.dtype)
+        alike *= jnp.sum(doubled(half(normal), normal) * normal, -1, keepdims=True)
+    size = jnp.maximum(jnp.sum(jnp.abs(light), -1, keepdims=True), least)
+    difference = divide(jnp.sum(jnp.abs(light - warped), -1, keepdims=True), size)
+    mask = _step(alike - similar, softness) * _step(difference - changed, softness)
+    if buffers.sky is not None:
+        known &= buffers.sky < 0.5
+    return jnp.where(known, mask, 0)
+
+
+def _halve_stage(preparation: Refinement) -> Stage:
+    """Both histories halved and guided-warped there, each by its own motion and buffers, and the halved roughness."""
+
+    def function(state, values: Values):
+        target, warped, sources = halved(values["target"].gbuffer), [], values["sources"]
+        divided = _have_albedo(target, *(source.gbuffer for source in sources))
+        for source, motion in zip(sources, values["motions"], strict=True):
+            buffers, color = halved(source.gbuffer), half(jnp.asarray(source.color))
+            shorter = half(motion) / 2
+            how: dict[str, Any] = {"by": preparation.by, "floor": preparation.floor}
+            light = demodulate(color, reflecting(buffers, preparation.sky), **how) if divided else color
+            holes = find_holes(target, buffers, shorter)
+            light = fetch_guided(light, shorter, holes, target, buffers, state.settings, preparation.space)
+            if divided and preparation.modulated:
+                light = modulate(light, reflecting(target, preparation.sky), **how)
+            warped.append(preparation.encode(light))
+        newer, older = warped
+        ones = jnp.ones_like(newer[..., :1])
+        rough = ones if target.roughness is None else jnp.asarray(target.roughness, newer.dtype)
+        return {"inputs": (newer, older, jnp.where(jnp.isfinite(rough), rough, 1))}
+
+    reads = ("since_oldest.motion", guides_of("history"))
+    takes = ("target", "sources", "motions")
+    return Stage("halved warps", function, takes, ("inputs",), reads=reads, past=2, optional=True)
+
+
+def extrass_refine(model: FRNet, *, preparation: Refinement = Refinement()) -> Method:
+    """The guided warp, its shading refined by a flow network at half size (ExtraSS, "Ours-E").
+
+    The two newest rendered frames are halved and guided-warped to the target, each by its own buffers, the motion to
+    the older one chained through the frames between. FRNet moves the newer one's light to where it is now: with the
+    target's roughness, halved too, these are `values["inputs"]` before the stage "network". Where its answer differs
+    from the guided warp at full size, and the surface is the same at both sizes, it is taken (`blend_mask`).
+
+    What a scene lacks is left out: without a second rendered frame, or motion that leads there, the answer is the
+    guided warp; where the newer and the older frame agree everywhere, no light moves, and no network runs; no albedo,
+    no demodulation; roughness that is absent counts as 1. The options are those of the guided warps and of the blend.
+
+    Args:
+        model: of any configuration.
+        preparation: what the model was trained on.
+
+    References:
+        Wu et al. 2023 (ExtraSS), section 4.3, eq. 4-6. Departures: see `blend_mask` and `extrass_warp`; what the paper
+        leaves open of the network says `jaxtrapolate.networks.FRNet`.
+    """
+    function, weights = inference(model)
+    stages = (*refinement_stages(function, model.config, preparation, weights_of=lambda all: all), SKY)
+    networks = {"network": function}
+    return Method(REFINE_NAME, stages, past=2, weights=weights, settings=Blend(), networks=networks)
+
+
+def refinement_stages(
+    function: Callable[..., Refined],
+    config: FRNetConfig,
+    preparation: Refinement,
+    *,
+    weights_of: Callable[[Any], Any],
+) -> tuple[Stage, ...]:
+    """The stages of `extrass_refine` that give the generated frame as "image", and the guided warp alone as "guided".
+
+    Args:
+        function: FRNet, as `inference` has it.
+        config: its configuration.
+        preparation: what it was trained on.
+        weights_of: takes its weights out of the method's.
+    """
+
+    def network(state, values: Values):
+        newer, older, roughness = values["inputs"]
+        found = function(weights_of(state.weights), newer, older, roughness if config.roughness else None)
+        return {"refined": found.image, "moves": jnp.ones((), bool)}
+
+    def blend(state, values: Values):
+        target, warped = values["target"].gbuffer, values["image"]
+        light = doubled(preparation.decode(values["refined"]), warped)
+        sources = values["sources"]
+        if not preparation.modulated and _have_albedo(target, *(source.gbuffer for source in sources)):
+            buffers = reflecting(target, preparation.sky)
+            light = modulate(light, buffers, by=preparation.by, floor=preparation.floor)
+        mask = jnp.where(values["moves"], blend_mask(light, warped, target, state.settings), 0)
+        light = jnp.where(jnp.isfinite(light), light, 0)
+        mixed = light * mask + warped.astype(light.dtype) * (1 - mask)
+        return {"image": jnp.where(mask > 0, mixed, warped).astype(warped.dtype)}
+
+    still = Needed(
+        "light moves",
+        lambda state, values: jnp.any(values["inputs"][0] != values["inputs"][1]),
+        lambda state, values: {"refined": values["inputs"][0], "moves": jnp.zeros((), bool)},
+    )
+    return (
+        reproject_stage(2),
+        HOLES,
+        demodulate_stage(preparation),
+        guided_stage(preparation.space),
+        modulate_stage(preparation),
+        Stage("guided frame", lambda state, values: {"guided": values["image"]}, ("image",), ("guided",)),
+        _halve_stage(preparation),
+        Stage("network", network, ("inputs",), ("refined", "moves"), optional=True, past=2, needed=still),
+        Stage("blend", blend, ("image", "refined", "moves", "sources", "target"), ("image",), optional=True, past=2),
+    )
+
+
+def _have_albedo(*buffers: GBuffer | None) -> bool:
+    return all(b is not None and b.albedo is not None for b in buffers)
+
+
+def encoded_truth(
+    color: Float[Array, "h w 3"], buffers: GBuffer | None, *, preparation: Refinement
+) -> Float[Array, "i j 3"]:
+    """The answer that FRNet should give: a frame's true colour at half size, as `preparation` has it.
+
+    Args:
+        color: `[H, W, 3]`, linear radiance.
+        buffers: of the same frame; without albedo nothing is demodulated.
+        preparation: of the network that is trained.
+
+    Raises:
+        TypeError, ValueError: no floating-point array, or a size that differs.
+    """
+    if not preparation.modulated and _have_albedo(buffers):
+        given = reflecting(buffers, preparation.sky)
+        color = demodulate(color, given, by=preparation.by, floor=preparation.floor)
+    return preparation.encode(half(color))
+
+
+def extrass_refine_config(config: FRNetConfig, preparation: Refinement) -> dict[str, Any]:
+    """What a file of weights states about them, as `load_refine` reads it."""
+    return {"network": dataclasses.asdict(config), "preparation": dataclasses.asdict(preparation)}
+
+
+def read_refine(path: str | PathLike[str]) -> tuple[FRNet, Refinement]:
+    """An FRNet and its preparation, from a file of weights of "extrass_refine"; see `load_network`."""
+
+    def build(stated: Mapping[str, Any]):
+        config = configured(FRNetConfig, stated.get("network", {}), source=str(path))
+        return lambda: FRNet(config, rngs=nnx.Rngs(0))
+
+    model, stated = load_network(path, REFINE_NAME, build)
+    return model, configured(Refinement, stated.get("preparation", {}), source=str(path))
+
+
+def load_refine(path: str | PathLike[str]) -> Method:
+    """The method "extrass_refine" with the weights in a file; see `read_refine`."""
+    model, preparation = read_refine(path)
+    return extrass_refine(model, preparation=preparation)
