@@ -10,6 +10,8 @@ from jaxtrapolate.training.config import config_names as config_names
 from jaxtrapolate.training.config import load_config as load_config
 from jaxtrapolate.training.config import parse_config as parse_config
 from jaxtrapolate.training.extranet import ExtraNetOptions, ExtraNetTask
+from jaxtrapolate.training.extrass import ExtraSSOptions, ExtraSSTask
+from jaxtrapolate.training.frnet import FRNetOptions, FRNetTask
 from jaxtrapolate.training.interpolator import InterpolatorOptions, InterpolatorTask
 from jaxtrapolate.training.loop import TrainingError as TrainingError
 from jaxtrapolate.training.loop import train_and_evaluate as train_and_evaluate
@@ -19,4 +21,6 @@ from jaxtrapolate.training.tasks import Task as Task
 
 TASKS["extranet"] = Entry(ExtraNetOptions, ExtraNetTask)
 TASKS["guided_net"] = Entry(ExtraNetOptions, partial(ExtraNetTask, method=guided_net.NAME))
+TASKS["extrass"] = Entry(ExtraSSOptions, ExtraSSTask)
+TASKS["extrass_refine"] = Entry(FRNetOptions, FRNetTask)
 TASKS["interpolator"] = Entry(InterpolatorOptions, InterpolatorTask)

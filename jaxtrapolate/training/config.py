@@ -84,6 +84,7 @@ class Config:
         optimizer: see `Optimizer`.
         ema_decay: of the exponential moving average of the weights, which is validated and exported; the weights
             themselves where absent.
+        frozen: parts of the network, attributes by name, whose weights stay what they are.
         precision: of the network while training; weights, averages and validation stay float32.
         log_every: steps from one line of the log to the next, the only times at which the host waits for the devices.
         checkpoint_every, validate_every: steps, multiples of `log_every`.
@@ -100,6 +101,7 @@ class Config:
     steps_per_round: int = 64
     optimizer: Optimizer = dataclasses.field(default_factory=Optimizer)
     ema_decay: float | None = None
+    frozen: tuple[str, ...] = ()
     precision: Precision = "float32"
     log_every: int = 50
     checkpoint_every: int = 500

@@ -116,6 +116,18 @@ def make_step(task: Task, config: Config) -> Step:
         model.train() if training else model.eval()
         return nnx.split(model, nnx.Param, nnx.BatchStat, ...)
 
+    def without(tree: Any) -> Any:
+        """A tree like the weights with zeros for the parts that are frozen."""
+        if not config.frozen:
+            return tree
+        if unknown := set(config.frozen) - set(tree):
+            raise ValueError(f"frozen: the network has no {', '.join(sorted(unknown))}; it has {', '.join(tree)}")
+
+        def kept(path: Any, leaf: Array) -> Array:
+            return jnp.zeros_like(leaf) if path[0].key in config.frozen else leaf
+
+        return jax.tree_util.tree_map_with_path(kept, tree)
+
     graph, evaluated = (nnx.eval_shape(lambda t=training: split(t))[0] for training in (True, False))
 
     def create() -> State:
@@ -151,9 +163,10 @@ def make_step(task: Task, config: Config) -> Step:
             return loss.astype(jnp.float32), (statistics, rest, dict(metrics))
 
         (loss, (statistics, rest, metrics)), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.weights)
+        gradient = without(gradient)
         with jax.numpy_dtype_promotion("standard"):  # which Optax counts on: it raises floats to counts of steps
             updates, moments = optimizer.update(gradient, state.moments, state.weights)
-            weights = optax.apply_updates(state.weights, updates)
+            weights = optax.apply_updates(state.weights, without(updates))
             used = {"gradient": optax.tree.norm(gradient), "learning_rate": rate(state.step)}
         average = state.average
         if config.ema_decay is not None:
