@@ -25,9 +25,9 @@ def _values(name: str, frames: Frames) -> Iterator[np.ndarray]:
     size = None
     for k, frame in enumerate(frames):
         values = np.asarray(frame)
-        values = np.float32(values) / 255 if values.dtype == np.uint8 else np.asarray(values)
-        size = check_image(f"{name}[{k}]", values, size=size, channels=3)
-        yield values.astype(np.float32)
+        given = values.astype(np.float32) / 255 if values.dtype == np.uint8 else values
+        size = check_image(f"{name}[{k}]", given, size=size, channels=3)
+        yield np.asarray(given, np.float32)
 
 
 def _score(name: str, values: list[float]) -> ClipScore:
