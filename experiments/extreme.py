@@ -10,6 +10,7 @@ scenes: differences of display values (0..1), over all pixels and channels.
 import argparse
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -65,25 +66,25 @@ def main() -> None:
     jaxtyping.config.update("jaxtyping_disable", True)
     result = json.loads(options.output.read_text()) if options.output.exists() else {}
     result |= {"machine": machine(), "seed": int(SEED), "size": list(SIZE), "scenes": options.scenes.split(",")}
-    parts = options.parts.split(",")
-    for part in ("functions", "methods"):
-        if part in parts:
-            cases = extreme_cases.function_cases() if part == "functions" else extreme_cases.method_cases()
-            chosen = options.names.split(",") if options.names else list(cases)
-            result[part] = {} if not options.names else result[part]
-            for name, case in ((n, c) for n, c in cases.items() if n in chosen):
-                result[part][name] = extreme_cases.examine(case)
-                print(part, name, result[part][name]["reach"], flush=True)
     result["listed"] = [[*key, reason] for key, reason in extreme_cases.LISTED.items()]
     result["means"] = list(extreme_cases.MEANS)
-    if "errors" in parts:
-        result["errors"] = {}
-        for name in method_names():
-            if name != "dis":  # on the host, by another library
-                result["errors"][name] = errors(name, tuple(options.scenes.split(",")))
-                print("errors", name, result["errors"][name], flush=True)
-    with atomic_path(options.output) as path:
-        path.write_text(json.dumps(result, indent=1) + "\n")
+    scenes = tuple(options.scenes.split(","))
+    rows = {
+        "functions": {
+            name: partial(extreme_cases.examine, case) for name, case in extreme_cases.function_cases().items()
+        },
+        "methods": {name: partial(extreme_cases.examine, case) for name, case in extreme_cases.method_cases().items()},
+        "errors": {name: partial(errors, name, scenes) for name in method_names()},
+    }
+    for part in options.parts.split(","):
+        chosen = options.names.split(",") if options.names else list(rows[part])
+        found = {name: row for name, row in result.get(part, {}).items() if name in rows[part]}
+        for name in (n for n in rows[part] if n in chosen):
+            found[name] = rows[part][name]()
+            print(part, name, found[name].get("reach", found[name]), flush=True)
+            result[part] = {name: found[name] for name in rows[part] if name in found}
+            with atomic_path(options.output) as path:
+                path.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

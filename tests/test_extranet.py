@@ -223,6 +223,27 @@ def test_the_guided_guess_is_the_guided_warp(methods):
     assert not np.allclose(found["x"][..., :3], plain["x"][..., :3], atol=0.1)
 
 
+def test_the_network_is_told_of_the_guess():
+    """How its light has moved, how far that is trusted, and how old what it shows is; zeros where no stage says."""
+    history, target = make_window()
+    config = ExtraNetConfig(widths=(4, 4), histories=3, guess=4)
+    told = {}
+    for first in ("guided", "shading"):
+        method = extranet(random_model(config), preparation=Preparation(first_guess=first))
+        told[first] = np.asarray(inputs(method, history, target)["features"])
+        assert told[first].shape == (*SIZE, 10)
+        assert np.isfinite(image_of(method, history, target)).all()
+    assert (told["guided"][..., 6:] == 0).all()
+    values = method.values_before("inputs", method.state, (), history, target)
+    flow, trust, age = (np.asarray(values[name]) for name in ("light_flow", "trust", "age"))
+    np.testing.assert_allclose(told["shading"][..., 6:8], flow / (16 + np.abs(flow)), atol=1e-6)
+    np.testing.assert_array_equal(told["shading"][..., 8:9], trust)
+    holes = np.asarray(values["holes"])
+    assert (age[~holes] == 0).all()
+    assert set(np.unique(age[holes])) <= {1, 2, 3}
+    np.testing.assert_allclose(told["shading"][..., 9:], age / 3, atol=1e-6)
+
+
 MISSING = {
     "albedo": ({"demodulate", "modulate"}, None),
     "depth": ({"occlusion motion"}, 3),
@@ -367,8 +388,8 @@ def test_ablations_of_the_paper_are_shown_less():
     assert found["history"] is None
     assert method.past == 1
     assert np.isfinite(image_of(method, history, target)).all()
-    for wrong in ({"features": 3}, {"warps": 3}):
-        with pytest.raises(ValueError, match="expected 6 features or none"):
+    for wrong in ({"features": 3}, {"warps": 3}, {"guess": 2}):
+        with pytest.raises(ValueError, match="expected features 6 or 0"):
             extranet(random_model(ExtraNetConfig(widths=(4, 4), **wrong)))
 
 

@@ -299,6 +299,25 @@ def test_any_size_against_a_network_in_float64(size):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("direct", [False, True])
+def test_what_tells_of_the_guess_comes_last(direct):
+    """With zeros for these inputs' weights it is the network without them; else they are features like others."""
+    size = {"widths": (3, 4), "features": 2, "histories": 2, "direct": direct}
+    more, plain = (ExtraNet(ExtraNetConfig(**size, guess=n), rngs=nnx.Rngs(0)) for n in (4, 0))
+    kernel = more.encoder[0].layers[0].feature.kernel
+    assert kernel.shape[2] == plain.encoder[0].layers[0].feature.kernel.shape[2] + 4
+    state = nnx.to_pure_dict(nnx.state(plain))
+    for part in ("feature", "gate"):
+        first = state["encoder"][0]["layers"][0][part]
+        first["kernel"] = jnp.pad(first["kernel"], ((0, 0), (0, 0), (0, 4 * (first["kernel"].shape[2] > 4)), (0, 0)))
+    nnx.update(more, state)
+    x, mask, features, history = (jnp.asarray(random(1, *s, seed=k)) for k, s in enumerate(shapes_of(9, 14)))
+    told = jnp.concatenate([features, jnp.asarray(random(1, 9, 14, 4, seed=9))], -1)
+    np.testing.assert_allclose(more(x, mask, told, history), plain(x, mask, features, history), atol=1e-6)
+    with pytest.raises(ValueError, match="features: expected shape"):
+        more(x, mask, features, history)
+
+
 def test_direct_is_a_network_with_the_histories_among_its_features():
     """The same weights, the histories appended to the target's buffers, oldest first."""
     direct = ExtraNet(ExtraNetConfig(widths=(3, 4), features=2, histories=2, direct=True), rngs=nnx.Rngs(0))

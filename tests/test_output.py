@@ -220,3 +220,5 @@ def test_json_that_cannot_be_read(tmp_path):
 def test_differences_are_named_in_full():
     assert differences({"a": {"b": 1}, "c": 2}, {"a": {"b": 1}, "c": 2}) == ""
     assert differences({"a": {"b": 1}}, {"a": {"b": 2}, "d": 3}) == "a.b was 1, is now 2; d was not there, is now 3"
+    old, new = {"a": {"b": 1, "bc": 1}, "d": {"e": 1}}, {"a": {"b": 2, "bc": 2}, "d": {"e": 2}}
+    assert differences(old, new, free=("d", "a.b")) == "a.bc was 1, is now 2"

@@ -22,19 +22,19 @@ def plain(unchecked):
     """NumPy arrays are taken, and the library's own errors seen."""
 
 
-def lit(time, *, speed=SPEED, pan=PAN):
+def lit(time, *, speed=SPEED, pan=PAN, at=48):
     """The light at a time: even, but for a soft round shadow that moves over the surfaces."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.float64)
-    away = np.hypot(x + pan * time - 48 - speed[0] * time, y - 34 - speed[1] * time)
+    away = np.hypot(x + pan * time - at - speed[0] * time, y - 34 - speed[1] * time)
     return 1.2 - 0.9 / (1 + np.exp((away - 15) / 1.2))
 
 
-def frame(time, *, speed=SPEED, pan=PAN, light=None, stamped=True, buffers=True):
+def frame(time, *, speed=SPEED, pan=PAN, at=48, light=None, stamped=True, buffers=True):
     """A textured wall seen by a camera that pans, lit by `lit` or by `light` times that of no shadow."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.float64)
     albedo = 0.5 + 0.2 * np.sin((x + pan * time) / 5) * np.cos(y / 7)
     albedo = albedo[..., None] * [1.0, 0.8, 0.6]
-    irradiance = lit(time, speed=speed, pan=pan) if light is None else np.full(SIZE, 1.2 * light)
+    irradiance = lit(time, speed=speed, pan=pan, at=at) if light is None else np.full(SIZE, 1.2 * light)
     motion = np.broadcast_to([pan, 0.0], (*SIZE, 2))
     flat = np.ones((*SIZE, 1))
     shown = {"albedo": albedo, "normal": flat * [0.0, 0.0, 1.0]} if buffers else {}
@@ -74,6 +74,17 @@ def test_shadow_goes_on(past):
     before, after = (db(method(name)(history, target), truth) for name in ("guided_warp", "shading_warp"))
     assert after > before + 8
     assert after > 38
+
+
+def test_shadow_goes_on_where_it_was_hidden():
+    """Beyond the border of the older frame, where only the newer one shows its surface."""
+    history, target, truth = window(3, functools.partial(frame, pan=4.0, at=88))
+    strip = np.s_[:, 88:96]
+    before, after = (
+        np.square(np.asarray(jx.tonemap(method(name)(history, target)) - jx.tonemap(truth))[strip]).mean()
+        for name in ("guided_warp", "shading_warp")
+    )
+    assert after < 0.75 * before
 
 
 @pytest.mark.slow

@@ -263,6 +263,17 @@ def test_a_run_begins_with_given_weights(whole, tmp_path):
     train_and_evaluate(dataclasses.replace(settings, start=str(other)), tmp_path / "adapts", task=Adapting())
     (line,) = [entry for entry in read_metrics(tmp_path / "adapts") if entry["kind"] == "start"]
     assert "norm was false" in line["other than the weights were trained on"]
+    narrow = dict(
+        loaded.tree, map=dict(loaded.tree["map"], kernel=np.asarray(loaded.tree["map"]["kernel"])[..., 1:, :])
+    )
+    other = save_weights(tmp_path, "toy", narrow, **about)
+    begun.clear()
+    run = dataclasses.replace(settings, start=str(other))
+    with pytest.raises(InputError, match="of another kind"):
+        train_and_evaluate(run, tmp_path / "wrong", task=ToyTask())
+    train_and_evaluate(run, tmp_path / "wider", task=Adapting())
+    np.testing.assert_allclose(begun[0]["map/kernel"][..., :-1, :], given["map/kernel"][..., 1:, :], rtol=1e-6)
+    assert np.abs(begun[0]["map/kernel"][..., -1, :]).max() < 1e-6
     with pytest.raises(InputError, match="no default weights"):
         train_and_evaluate(dataclasses.replace(settings, start="default"), tmp_path / "wrong", task=ToyTask())
 

@@ -51,6 +51,7 @@ from jaxtrapolate.records import GBuffer
 from jaxtrapolate.weights import configured, read_torch
 
 NAME = "extranet"
+_FAR = 16.0  # pixels of light's motion, half of all that is told apart
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,6 +162,19 @@ def features(buffers: GBuffer | None, like: Float[Array, "h w c"], preparation: 
     return jnp.where(jnp.isfinite(shown), shown, 0)  # one that is not would reach as far as the network looks
 
 
+def of_guess(values: Values, like: Float[Array, "h w c"]) -> Float[Array, "h w 4"]:
+    """What the network is shown of the first guess `[H, W, 4]`: how its light has moved, the trust in that, its age.
+
+    The motion is flow / (16 + |flow|), the age 0 for the newest frame and 1 for what no frame has seen. Zeros for what
+    no stage has given.
+    """
+    nothing = jnp.zeros((*like.shape[:2], 1), like.dtype)
+    given = (values[name] for name in ("light_flow", "trust", "age"))
+    flow, trust, age = (nothing if value is None else value.astype(like.dtype) for value in given)
+    flow = jnp.broadcast_to(flow, (*like.shape[:2], 2))
+    return jnp.concatenate([flow / (_FAR + jnp.abs(flow)), trust, age / 3], -1)
+
+
 def encode(image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
     """log(1 + r) in at least float32; what is negative or not finite counts as 0."""
     image = image.astype(widest(image))
@@ -210,10 +224,12 @@ def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
         guesses = [first, encode(in_space(preparation.space, along, values["layers"][0][..., :3]))]
         sources = [jnp.concatenate(pair, -1) for pair in zip(warped, valid, strict=True)]
         sources = [sources[min(k, len(sources) - 1)] for k in range(config.histories)]
+        shown = [features(values["target"].gbuffer, first, preparation)] if config.features else []
+        shown += [of_guess(values, first)] if config.guess else []
         inputs = {
             "x": jnp.concatenate(guesses[: config.warps], -1),
             "mask": valid[0],
-            "features": features(values["target"].gbuffer, first, preparation) if config.features else None,
+            "features": jnp.concatenate(shown, -1) if shown else None,
             "history": jnp.stack(sources[::-1]) if sources else None,
         }
         motions, still = values["motions"], jnp.zeros_like(values["holes"])
@@ -222,6 +238,7 @@ def _inputs_stage(config: ExtraNetConfig, preparation: Preparation) -> Stage:
         return {"inputs": inputs, "still": still}
 
     takes = ("target", "layers", "masks", "sources", "motions", "histories", "warped", *COMPOSITE)
+    takes += ("light_flow?", "trust?", "age?") if config.guess else ()
     return Stage("inputs", function, takes, ("inputs", "still"))
 
 
@@ -230,13 +247,14 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
 
     The three newest rendered frames are warped to the target, demodulated, and with masks; where fewer can be had the
     oldest is repeated. The network sees x `[H, W, 6]` (the first guess and the occlusion composite), mask `[H, W, 1]`,
-    features `[H, W, 6]` and history `[3, H, W, 4]`, oldest first, all in the log domain: these are `values["inputs"]`
-    of the stages before "network". Its answer is decoded and modulated. The sky is the engine's where it draws it
-    apart, else that of the newest frame, warped as the first guess is. Outside holes the network's correction is held
-    within what its inputs differ by (`explained`), and where nothing moves and all rendered frames are equal, tile by
-    tile, the newest is the result (`standing`). Where the guided warp makes the first guess, hindsight mixes in that of
-    the undivided colour: of the guess 1 - share is left and of the network's correction 1 - share^2. The options are
-    then those of the guided warp, and of hindsight; all else that could be set was set when the network was trained.
+    features `[H, W, 6]` (4 more with the network's `guess`, see `of_guess`) and history `[3, H, W, 4]`, oldest first,
+    all in the log domain: these are `values["inputs"]` of the stages before "network". Its answer is decoded and
+    modulated. The sky is the engine's where it draws it apart, else that of the newest frame, warped as the first guess
+    is. Outside holes the network's correction is held within what its inputs differ by (`explained`), and where nothing
+    moves and all rendered frames are equal, tile by tile, the newest is the result (`standing`). Where the guided warp
+    makes the first guess, hindsight mixes in that of the undivided colour: of the guess 1 - share is left and of the
+    network's correction 1 - share^2. The options are then those of the guided warp, and of hindsight; all else that
+    could be set was set when the network was trained.
 
     What a scene lacks is left out: no albedo, no demodulation; no depth, no occlusion motion, the composite is the
     warp; normal, depth, roughness or metallic that are absent are zeros; masks are those that the buffers allow.
@@ -247,15 +265,15 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
         name: of the method.
 
     Raises:
-        ValueError: a model with other features than these 6 or none, or with more warped images than these two.
+        ValueError: a model with other features than these or none, or with more warped images than these two.
 
     References:
         Guo et al. 2021 (ExtraNet), sections 4 and 5.2, and the authors' release. Departures: motion is chained with
         interpolation and is not dilated; the sky is not taken from the target's own colour.
     """
     config = model.config
-    if config.features not in (0, 6) or not 1 <= config.warps <= 2:
-        raise ValueError(f"model: expected 6 features or none and 1 or 2 warped images, got {config}")
+    if config.features not in (0, 6) or config.guess not in (0, 4) or not 1 <= config.warps <= 2:
+        raise ValueError(f"model: expected features 6 or 0, guess 4 or 0, and 1 or 2 warped images, got {config}")
     function, weights = inference(model)
     guided = ()
     if preparation.first_guess != "warp":

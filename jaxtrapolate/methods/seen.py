@@ -133,6 +133,9 @@ def _ratio(now: Array, then: Array, both: Array, most: Array) -> Array:
 def seen_before_stage(space: Space | None = None) -> Stage:
     """Fills what is hidden in the newest frame, and what lies beyond it, from the newest older frame that saw it.
 
+    It gives "age" too: 0 where the newest frame shows what is there, then how many frames before it that one is which
+    does, and one more than are looked at where none does.
+
     Args:
         space: in which colours are fetched; `None` = the method's option.
     """
@@ -140,6 +143,7 @@ def seen_before_stage(space: Space | None = None) -> Stage:
     def function(state, values: Values):
         how, history, target = state.settings, values["history"], values["target"]
         warped, left = values["warped"], values["holes"]
+        age = jnp.zeros(left.shape, widest(warped))
         around = ~left  # whose light is compared: what stands, where ids tell it
         if target.gbuffer.stencil is not None:
             around &= target.gbuffer.stencil < 0.5
@@ -161,20 +165,25 @@ def seen_before_stage(space: Space | None = None) -> Stage:
                 return jnp.where(left & seen, found.astype(warped.dtype), warped)
 
             warped = jax.lax.cond(jnp.any(left & seen), fill, lambda warped: warped, warped)
+            age += left.astype(age.dtype)  # once for each frame that is looked at in vain, and for the one that has it
             left = left & ~seen
-        return {"warped": warped, "image": warped[..., :3]}
+        return {"warped": warped, "image": warped[..., :3], "age": age + left.astype(age.dtype)}
 
     return Stage(
         "seen before",
         function,
         takes=("history", "target", "sources", "layers", "holes", "warped"),
-        gives=("warped", "image"),
+        gives=("warped", "image", "age"),
         reads=("target.position", "history.position", guides_of("history")),
         optional=True,
         past=2,
         needed=Needed(
             "there are holes",
             lambda state, values: jnp.any(values["holes"]),
-            lambda state, values: {"warped": values["warped"], "image": values["warped"][..., :3]},
+            lambda state, values: {
+                "warped": values["warped"],
+                "image": values["warped"][..., :3],
+                "age": jnp.zeros(values["holes"].shape, widest(values["warped"])),
+            },
         ),
     )

@@ -98,20 +98,23 @@ class Pair(NamedTuple):
     guide: Array | None
 
 
-def _flows(pairs: Sequence[Pair], how: Any) -> list[tuple[Array, Array]]:
-    """The shading flow of each pair, and how far to trust it; in a loop, so that it is compiled once."""
+def _flows(pairs: Sequence[Pair], how: Any, *, hidden: bool) -> list[tuple[Array, Array]]:
+    """The shading flow of each pair, and how far to trust it; in a loop, so that it is compiled once.
+
+    hidden: whether it is looked for, too, where one of the two does not show the surface that it should; what the
+    guided warp has put there is light of like surfaces around.
+    """
 
     def one(pair: Pair) -> tuple[Array, Array]:
         options = {"least_gain": how.least_gain, "least_change": how.least_change, "reach": how.reach}
-        return shading_flow(
-            pair.first, pair.second, guide=pair.guide, valid=pair.seen[..., 0], sigma_guide=_SIGMA, **options
-        )
+        valid = None if hidden else pair.seen[..., 0]
+        return shading_flow(pair.first, pair.second, guide=pair.guide, valid=valid, sigma_guide=_SIGMA, **options)
 
     found = jax.lax.map(one, jax.tree.map(lambda *leaves: jnp.stack(leaves), *pairs))
     return [jax.tree.map(lambda leaf, k=k: leaf[k], found) for k in range(len(pairs))]
 
 
-def _changes(first: Array, second: Array, valid: Array, least: Array) -> Array:
+def _changes(first: Array, second: Array, valid: Array, least: float | Array) -> Array:
     """Whether light changes anywhere by what counts as a change, and not nearly everywhere by much.
 
     Where nothing changes there is no trust in any flow; and light that is another all over the frame has not moved: it
@@ -185,7 +188,7 @@ def _continue(state, values: Values):
     if then is not None:
         first, second, seen = then
         pairs.append(Pair(first, second, seen, guides[1]))
-    (flow, trust), *others = _flows(pairs, how)
+    (flow, trust), *others = _flows(pairs, how, hidden=True)
     if then is not None:
         steps = steps_on(history, places[2], places[1], newest, places[0] - places[1])
         truth = compress(values["layers"][0][..., :3])
@@ -194,12 +197,13 @@ def _continue(state, values: Values):
         agreed = jnp.clip((from_blocks(better, x, y) - how.agreement) / _SURE, 0, 1)
         trust = trust * agreed.astype(trust.dtype)
     steps = steps_on(history, places[1], places[0], values["target"], len(history) - places[0])
-    return {"light": backward_warp(pairs[0].first, steps.astype(flow.dtype) * flow), "trust": trust}
+    flow = steps.astype(flow.dtype) * flow
+    return {"light": backward_warp(pairs[0].first, flow), "trust": trust, "light_flow": flow}
 
 
 def _stays(state, values: Values):
     light = compress(values["warped"][..., :3])
-    return {"light": light, "trust": jnp.zeros_like(light[..., :1])}
+    return {"light": light, "trust": jnp.zeros_like(light[..., :1]), "light_flow": jnp.zeros_like(light[..., :2])}
 
 
 def _better(pair: Pair, flow: Array, steps: Array, truth: Array) -> Array:
@@ -267,7 +271,7 @@ def light_stages(space: Space | None = None) -> tuple[Stage, ...]:
         "shading flow",
         _continue,
         takes=("target", "history", "newest", "layers", "motion", "warped", "light_before", "seen", "light_then?"),
-        gives=("light", "trust"),
+        gives=("light", "trust", "light_flow"),
         optional=True,
         needed=Needed("light changes, but not all of it", _light_changes, _stays),
     )
@@ -289,7 +293,7 @@ def _towards(state, values: Values):
     first, second = (compress(layers[..., :3]) for layers in values["fetched"])
     seen, (guide,) = values["seen"][0] & values["seen"][1], _silhouettes(values["target"].gbuffer)
     pairs = Pair(first, second, seen, guide), Pair(second, first, seen, guide)
-    (onward, trust_onward), (back, trust_back) = _flows(pairs, state.settings)
+    (onward, trust_onward), (back, trust_back) = _flows(pairs, state.settings, hidden=False)
     trust = jnp.maximum(trust_onward, trust_back)
     flow = divide(trust_onward * onward - trust_back * back, trust_onward + trust_back)
     alpha = values["alpha"].astype(flow.dtype)

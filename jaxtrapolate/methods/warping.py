@@ -1,10 +1,12 @@
 """The methods without weights that warp the newest rendered frame."""
 
 from functools import partial, reduce
+from itertools import chain
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.methods.frames import rendered
@@ -83,8 +85,7 @@ def occlusion_warp() -> Method:
     return Method("occlusion_warp", stages, past=2, settings=Demodulation())
 
 
-_GUIDES = ("albedo", "normal")
-_INSTEAD = ("stencil", "depth")
+_GROUPS = ("albedo", "normal"), ("stencil", "depth")  # what guides: the first group of which there is any
 _LOGARITHM = 2.0  # of the depth as a guide: with the default sigma, 1.5 % of the depth is one sigma
 
 
@@ -107,18 +108,21 @@ class GuidedSettings(Guide, Demodulation):
     """Of demodulation and of the guided warp."""
 
 
-def _compared(target, source, motion, names):
-    """Those of these buffers that both frames have, as `[H, W, G]` of each; `None` where there is none."""
+def _compared(target, source, motion, names) -> dict[str, tuple[jax.Array, jax.Array]]:
+    """Those of these buffers that both frames have, of each `[H, W, G]`, by name."""
     both = [n for n in names if getattr(target, n) is not None and getattr(source, n) is not None]
-    if not both:
-        return None
-    first, second = ([getattr(g, n) for n in both if n != "depth"] for g in (target, source))
-    if "depth" in both:
-        depths = (surface_depth(jnp.asarray(g.depth), g.sky) for g in (target, source))
-        then, there = next(depths), next(depths)
-        then = expected_depth(then, there, motion)
-        first, second = ([*a, _LOGARITHM * jnp.log(held(d))] for a, d in ((first, then), (second, there)))
-    return tuple(jnp.concatenate(a, -1) for a in (first, second))
+    found = {n: (getattr(target, n), getattr(source, n)) for n in both}
+    if "depth" in found:
+        then, there = (surface_depth(jnp.asarray(g.depth), g.sky) for g in (target, source))
+        then, there = (_LOGARITHM * jnp.log(held(d)) for d in (expected_depth(then, there, motion), there))
+        found["depth"] = then, there
+    return found
+
+
+def _guiding(target, source) -> tuple[str, ...]:
+    """Which buffers guide; none where the frames have none in common."""
+    shared = [tuple(n for n in names if None not in (getattr(target, n), getattr(source, n))) for names in _GROUPS]
+    return next(filter(None, shared), ())
 
 
 def guides(target, source, motion):
@@ -127,13 +131,15 @@ def guides(target, source, motion):
     Of depth it is twice the logarithm, so that it has no unit; the target's is the depth that its surfaces are expected
     to have in the source (`expected_depth`).
     """
-    found = _compared(target, source, motion, _GUIDES) or _compared(target, source, motion, _INSTEAD)
-    return check_present("albedo, normal, stencil or depth", found, needed_by="the guided warp")
+    names = _guiding(target, source)
+    check_present("albedo, normal, stencil or depth", names or None, needed_by="the guided warp")
+    both = zip(*_compared(target, source, motion, names).values(), strict=True)
+    return tuple(jnp.concatenate(images, -1) for images in both)
 
 
 def guides_of(role: str) -> str:
     """What a stage reads that compares the target with the frames of a role by `guides`: one that both have."""
-    return "|".join(f"target+{role}.{name}" for name in (*_GUIDES, *_INSTEAD))
+    return "|".join(f"target+{role}.{name}" for name in chain.from_iterable(_GROUPS))
 
 
 def fetch_guided(image, motion, holes, target, source, how: Any, space: Space):
@@ -161,49 +167,40 @@ _CONTRAST = 0.01
 """Variance of those four, after the tone curve, from which on light ends between them."""
 
 
-def _agree(pair, motion):
-    """Where what lies between the four pixels is the target's, of two guides `[H, W, G]`."""
-    wanted, there = map(jax.lax.stop_gradient, pair)
-    apart = jnp.square(wanted - backward_warp(there, motion))
-    return jnp.sum(apart, -1, keepdims=True) <= _AGREES
-
-
-def _light_ends(image, motion):
-    """Where the four pixels around where the motion leads differ in brightness."""
-    bright = jax.lax.stop_gradient(jnp.max(compress(image.astype(widest(image))), -1, keepdims=True))
-    mean, square = jnp.split(backward_warp(jnp.concatenate([bright, bright * bright], -1), motion), 2, -1)
-    return square - mean * mean > _CONTRAST
-
-
-def _surface(target, source, motion):
-    """Where normals and depth, those that both frames have, agree; `None` where there are none of them."""
-    pairs = [_compared(target, source, motion, (name,)) for name in ("normal", "depth")]
-    found = [_agree(pair, motion) for pair in pairs if pair is not None]
-    return reduce(jnp.logical_and, found) if found else None
-
-
 def _bilinear(image, warped, values: Values, space: Space, network: bool):
     """What the guided warp has fetched, and bilinearly where no guide says which pixels are alike.
 
     Neither albedo nor normal says where a panel that shines ends, or a shadow: the guided warp breaks such an edge into
     dots. Outside holes, the undivided colour is fetched bilinearly where all guides agree, and the demodulated one
-    where light ends on one surface. On 48 windows of training seeds of eight scenes, on which this was chosen, the
-    guided warp gains 0.02 to 0.16 dB by scene, 0.08 on the mean. A network corrects what it was trained on: the second
-    costs it 0.2 dB on one scene, so that it is left out there, and the first is worth 0.05 (-0.03 to 0.16).
+    where light ends on one surface, by normal and depth. On 48 windows of training seeds of eight scenes, on which this
+    was chosen, the guided warp gains 0.02 to 0.16 dB by scene, 0.08 on the mean. A network corrects what it was trained
+    on: the second costs it 0.2 dB on one scene, so that it is left out there, and the first is worth 0.05 (-0.03 to
+    0.16).
     """
-    target, source, motion, seen = (
-        values["target"].gbuffer,
-        values["newest"].gbuffer,
-        values["motion"],
-        ~values["holes"],
-    )
-    fetch = partial(in_space, space, partial(backward_warp, motion=motion))
-    divided, own = warped[..., :3], warped[..., 3:]
-    own = jnp.where(seen & _agree(guides(target, source, motion), motion), fetch(image[..., 3:]), own)
-    surface = None if network else _surface(target, source, motion)
-    if surface is not None:
-        ends = seen & surface & _light_ends(image[..., :3], motion)
-        divided = jnp.where(ends, fetch(image[..., :3]), divided)
+    frames, motion = (values["target"].gbuffer, values["newest"].gbuffer), values["motion"]
+    guiding, surface = _guiding(*frames), () if network else ("normal", "depth")
+    compared = _compared(*frames, motion, dict.fromkeys((*guiding, *surface)))
+    compared = {name: [jax.lax.stop_gradient(a.astype(widest(a))) for a in pair] for name, pair in compared.items()}
+    bright = jax.lax.stop_gradient(jnp.max(compress(image[..., :3].astype(widest(image))), -1, keepdims=True))
+    there = [pair[1] for pair in compared.values()]
+    sizes = [a.shape[-1] for a in (*there, bright, bright)]
+
+    def fetch(colors):
+        return backward_warp(jnp.concatenate([*there, bright, bright * bright, colors], -1), motion)
+
+    found = in_space(space, fetch, image.astype(widest(image)))
+    *there, mean, square, plain = jnp.split(found, np.cumsum(sizes), -1)
+    off = {n: jnp.square(pair[0] - b) for (n, pair), b in zip(compared.items(), there, strict=True)}
+
+    def agree(names):
+        return jnp.sum(jnp.concatenate([off[n] for n in names], -1), -1, keepdims=True) <= _AGREES
+
+    seen, plain = ~values["holes"], plain.astype(warped.dtype)
+    own = jnp.where(seen & agree(guiding), plain[..., 3:], warped[..., 3:])
+    divided, known = warped[..., :3], [name for name in surface if name in off]
+    if known:
+        alike = reduce(jnp.logical_and, (agree([name]) for name in known))
+        divided = jnp.where(seen & alike & (square - mean * mean > _CONTRAST), plain[..., :3], divided)
     return jnp.concatenate([divided, own], -1)
 
 

@@ -31,6 +31,8 @@ class ExtraNetConfig:
         norm: whether layers have batch norms; without them initial weights keep the size of signals, ours.
         direct: whether the encoder of the frame sees the histories too, at full resolution; ours, not the paper's.
         contrast: where above 0, all images but x's first are shown as their difference to that one, times this; ours.
+        guess: channels that tell of x's first image, last in features and last of what the encoder sees, so that
+            weights without them can be trained further with them; 0 for none; ours.
     """
 
     widths: tuple[int, ...] = (24, 24, 32, 32)
@@ -41,6 +43,7 @@ class ExtraNetConfig:
     norm: bool = True
     direct: bool = False
     contrast: float = 0.0
+    guess: int = 0
 
     @property
     def multiple(self) -> int:
@@ -71,7 +74,7 @@ class ExtraNet(nnx.Module):
     def __init__(self, config: ExtraNetConfig = ExtraNetConfig(), *, rngs: nnx.Rngs):
         widths, gate = config.widths, config.gate
         self.config = config
-        inputs = 2 * 3 * config.warps + config.features + (4 * config.histories if config.direct else 0)
+        inputs = 2 * 3 * config.warps + config.features + config.guess + (4 * config.histories if config.direct else 0)
         usual: dict[str, Any] = {"rngs": rngs}
         gated: dict[str, Any] = {"gate": gate, "rngs": rngs}
         bare: dict[str, Any] = {"norm": False, "activation": "none", "rngs": rngs}
@@ -122,8 +125,8 @@ class ExtraNet(nnx.Module):
             x: `[B, H, W, 6]`, log(1 + r) of the newest rendered frame, warped by its motion, then of its occlusion
                 composite. Any size from 1 x 1 on: inside it is padded, see `pad_to_multiple`.
             mask: `[B, H, W, 1]`, 1 = valid, 0 = hole.
-            features: `[B, H, W, 6]`: world normal, depth, roughness, metallic of the target; `None` where the
-                configuration has none.
+            features: `[B, H, W, 6]`: world normal, depth, roughness, metallic of the target, and further ones of the
+                configuration's `guess`; `None` where it has none of both.
             history: `[B, N, H, W, 4]`, oldest first: each warped frame's log(1 + r), then its mask; `None` likewise.
 
         Returns:
@@ -160,19 +163,20 @@ class ExtraNet(nnx.Module):
             first = x[..., :3]
             others = x[..., 3:].reshape(*size, config.warps - 1, 3) - first[..., None, :]
             x = jnp.concatenate([first, config.contrast * others.reshape(*size, 3 * config.warps - 3)], -1)
-        inputs = [x, x * mask]
-        if config.features:
+        inputs, guess = [x, x * mask], []
+        if config.features + config.guess:
             features = check_present("features", features, needed_by="this network")
-            check_array("features", features, shape=(*size, config.features))
-            inputs.append(features)
+            check_array("features", features, shape=(*size, config.features + config.guess))
+            inputs.append(features[..., : config.features])
+            guess = [features[..., config.features :]]
         if not config.histories:
-            return inputs, None
+            return inputs + guess, None
         history = check_present("history", history, needed_by="this network")
         check_array("history", history, shape=(size[0], config.histories, *size[1:], 4))
         if config.contrast:
             images = config.contrast * (history[..., :3] - first[:, None])
             history = jnp.concatenate([images, history[..., 3:]], -1)
-        return inputs + (list(jnp.moveaxis(history, 1, 0)) if config.direct else []), history
+        return inputs + (list(jnp.moveaxis(history, 1, 0)) if config.direct else []) + guess, history
 
     def _encode(self, history):
         """All histories in one pass through their common encoder, then merged: `[B, h, w, C]`."""

@@ -306,10 +306,17 @@ def code() -> str:
     return digest.hexdigest()[:8]
 
 
-def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """What differs between two nested tables that JSON can hold, by the names of their entries; empty if nothing."""
+def differences(old: Mapping[str, Any], new: Mapping[str, Any], *, free: Iterable[str] = ()) -> str:
+    """What differs between two nested tables that JSON can hold, by the names of their entries; empty if nothing.
+
+    Args:
+        old: a table.
+        new: a later one.
+        free: names, as "table.entry", of entries or tables that may differ.
+    """
     before, after = (_flat(json.loads(json.dumps(table))) for table in (old, new))
     differ = [k for k in {**before, **after} if before.get(k) != after.get(k)]
+    differ = [k for k in differ if not any(f"{k}.".startswith(f"{name}.") for name in free)]
     return "; ".join(f"{k} was {_show(before, k)}, is now {_show(after, k)}" for k in differ)
 
 

@@ -85,7 +85,7 @@ class ExtraNetTask:
     """
 
     score = "gain"
-    adapts = ("preparation",)
+    adapts = ("preparation", "network.guess")
 
     def __init__(self, options: ExtraNetOptions = ExtraNetOptions(), *, method: str = NAME) -> None:
         self.options = options

@@ -107,11 +107,10 @@ def _begun(state: State, start: str, task: Task) -> tuple[State, str]:
         weights = read_weights(default_weights(method) if start == "default" else start)
         if weights.method is not None:
             own, wanted = {"method": weights.method, **weights.config}, {"method": method, **task.about["config"]}
-            fixed = ({k: v for k, v in table.items() if k not in free} for table in (own, wanted))
-            if differ := differences(*fixed):
+            if differ := differences(own, wanted, free=free):
                 raise ValueError(f"start: {weights.source} holds weights of another kind: {differ}")
             changed = differences(own, wanted)
-        return started(state, weights), changed
+        return started(state, weights, widened=bool(changed)), changed
     except OSError as error:
         raise os_input_error(start, error) from error
     except ValueError as error:

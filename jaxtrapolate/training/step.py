@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import nnx
 from jax.sharding import PartitionSpec
@@ -16,6 +17,7 @@ from jaxtrapolate.training import devices
 from jaxtrapolate.training.config import Config, Optimizer
 from jaxtrapolate.training.tasks import Batch, Example, Task, init_key, step_key
 from jaxtrapolate.weights import Weights, fit
+from jaxtrapolate.weights.tree import named
 
 
 @record
@@ -87,18 +89,35 @@ def _averaged(decay: float, count: Array, old: Any, new: Any) -> Any:
     return jax.tree.map(lambda o, n: (o * keep + n * (1 - keep)).astype(o.dtype), old, new)
 
 
-def started(state: State, weights: Weights) -> State:
+def started(state: State, weights: Weights, *, widened: bool = False) -> State:
     """An initial state that begins with given weights and statistics.
+
+    Args:
+        state: the initial one.
+        weights: of the same network; with `widened`, of one whose convolutions may lack the last of their inputs. These
+            then begin at zero.
 
     Raises:
         ValueError: one line that names the source: weights that do not fit.
     """
     both = nnx.merge_state(state.weights, state.statistics)
-    found = fit(nnx.to_pure_dict(both), weights.tree, source=weights.source)
+    template, tree = nnx.to_pure_dict(both), weights.tree
+    if widened:
+        expected = named(template)
+        tree = {name: _wider(leaf, expected.get(name, leaf)) for name, leaf in named(tree).items()}
+    found = fit(template, tree, source=weights.source)
     nnx.replace_by_pure_dict(both, jax.device_put(found, devices.replicated()))
     given = nnx.split_state(both, nnx.Param, nnx.BatchStat)
     average = None if state.average is None else jax.tree.map(jnp.copy, given)  # a step gives up the memory of each
     return replace(state, weights=given[0], statistics=given[1], average=average)
+
+
+def _wider(kernel: Any, template: Any) -> Any:
+    """A kernel `[..., I, O]` with zeros for the last of its inputs, where the template has more of them."""
+    if not np.ndim(kernel) == np.ndim(template) > 1:
+        return kernel
+    more = np.subtract(np.shape(template), np.shape(kernel))
+    return np.pad(kernel, [(0, n) for n in more]) if more[-2] > 0 and np.count_nonzero(more) == 1 else kernel
 
 
 def make_step(task: Task, config: Config) -> Step:

@@ -26,8 +26,8 @@ class Task(Protocol):
 
     Attributes:
         score: name of the metric of `validate` by which the best checkpoint is told; larger is better.
-        adapts: names in `about["config"]` that weights to start from need not share, as how inputs are prepared. May be
-            absent: none.
+        adapts: names in `about["config"]`, as "network.guess", that weights to start from need not share, as how inputs
+            are prepared. Inputs that they do not know come last, and count for nothing at first. May be absent: none.
         about: what the exported weights say about themselves, as in JSON: "method", "config" to build its network with,
             "note".
 
