@@ -94,8 +94,9 @@ def started(state: State, weights: Weights, *, widened: bool = False) -> State:
 
     Args:
         state: the initial one.
-        weights: of the same network; with `widened`, of one whose convolutions may lack the last of their inputs. These
-            then begin at zero.
+        weights: of the same network.
+        widened: whether the weights may be of a network whose convolutions lack the last of their inputs. These then
+            begin at zero.
 
     Raises:
         ValueError: one line that names the source: weights that do not fit.
