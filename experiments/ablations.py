@@ -34,7 +34,7 @@ from jaxtrapolate.evaluation.score import causes_of, mean_over_frames, score
 from jaxtrapolate.evaluation.windows import arguments, windows
 from jaxtrapolate.methods import Method
 from jaxtrapolate.methods.extranet import Preparation
-from jaxtrapolate.methods.guided_net import NAME, NETWORK, PREPARATION, guided_net
+from jaxtrapolate.methods.guided_net import NAME, guided_net
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
 from jaxtrapolate.ops.causes import CAUSES
 from jaxtrapolate.results import FrameScore
@@ -50,13 +50,14 @@ ALONE = "walkers"
 UNLEARNED = ("warp", "occlusion_warp", "guided_warp", "first guess")
 """For comparison; "first guess" is the method with a network that corrects nothing."""
 
+NETWORK = ExtraNetConfig(norm=False, direct=True, contrast=4.0)
 PLAIN = ExtraNetOptions(
     network=NETWORK,
     space="display",
     loss="relative",
     hole_weight=0.0,
     crops="error",
-    preparation=PREPARATION,
+    preparation=Preparation(first_guess="guided"),
     windows=WindowOptions(size=SIZE),
     crop=(64, 64),
 )

@@ -15,7 +15,8 @@ import jaxtrapolate as jx
 from jaxtrapolate.errors import InputError
 from jaxtrapolate.evaluation.windows import Window, hide
 from jaxtrapolate.files import write_unreal_frame
-from jaxtrapolate.methods.extranet import Preparation, extranet
+from jaxtrapolate.methods.extranet import Preparation, extranet, extranet_config
+from jaxtrapolate.methods.guided_net import NETWORK, PREPARATION
 from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
 from jaxtrapolate.records import replace
 from jaxtrapolate.training import (
@@ -30,6 +31,7 @@ from jaxtrapolate.training import (
 )
 from jaxtrapolate.training.config import parse_config
 from jaxtrapolate.training.windows import WindowOptions
+from jaxtrapolate.weights import default_weights, read_weights
 
 SMALL = ExtraNetConfig(widths=(4, 6))
 OPTIONS = ExtraNetOptions(network=SMALL, windows=WindowOptions(size=(32, 40)), crop=(16, 24), validation=2)
@@ -197,6 +199,13 @@ def test_shipped_configurations():
         assert isinstance(config.options, ExtraNetOptions)
         multiple = config.options.network.multiple
         assert all(side % multiple == 0 for side in config.options.crop)
+
+
+def test_fine_tuning_fits_the_default_weights():
+    stated = read_weights(default_weights("guided_net")).config
+    options = load_config("guided_net_more").options
+    assert stated == extranet_config(options.network, options.preparation)
+    assert stated == extranet_config(NETWORK, PREPARATION)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Our own network as a method: ExtraNet's stages, with the guided warp as the image that the network corrects."""
+"""Our own network as a method: ExtraNet's stages, the network corrects the image of `shading_warp`."""
 
 from os import PathLike
 
@@ -8,15 +8,15 @@ from jaxtrapolate.networks.extranet import ExtraNet, ExtraNetConfig
 
 NAME = "guided_net"
 
-NETWORK = ExtraNetConfig(norm=False, direct=True, contrast=4.0)
+NETWORK = ExtraNetConfig(norm=False, direct=True, contrast=4.0, guess=4)
 """The network of the default weights: no batch norms, histories at full resolution too, images as differences."""
 
-PREPARATION = Preparation(first_guess="guided")
-"""What it is shown."""
+PREPARATION = Preparation(first_guess="shading", space="tone")
+"""What it is shown: the image of `shading_warp`, how its light has moved, and how old what it shows is."""
 
 
 def guided_net(model: ExtraNet, *, preparation: Preparation = PREPARATION) -> Method:
-    """The guided warp corrected by a network that sees three warped rendered frames and the target's buffers.
+    """The image of `shading_warp`, corrected by a network that sees three warped rendered frames and target's buffers.
 
     The method `extranet` but for its configuration: see there for what the network is shown and what is left out.
 
