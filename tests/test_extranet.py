@@ -223,6 +223,7 @@ def test_the_guided_guess_is_the_guided_warp(methods):
     assert not np.allclose(found["x"][..., :3], plain["x"][..., :3], atol=0.1)
 
 
+@pytest.mark.slow
 def test_the_network_is_told_of_the_guess():
     """How its light has moved, how far that is trusted, and how old what it shows is; zeros where no stage says."""
     history, target = make_window()

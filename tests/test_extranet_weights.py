@@ -35,11 +35,14 @@ def model():
 
 
 def test_default_weights_are_of_the_public_layout():
-    """The bare network takes x, mask, features and history as the authors' does; a file tells what it is."""
+    """The bare network takes x, mask, features and history as the authors' does; a file tells what it is.
+
+    Last in the features is what is known of the first guess.
+    """
     method = jx.load("guided_net")
     x, mask, features, history = (
         jnp.asarray(oracles.random(*shape, seed=k))
-        for k, shape in enumerate(((9, 13, 6), (9, 13, 1), (9, 13, 6), (3, 9, 13, 4)))
+        for k, shape in enumerate(((9, 13, 6), (9, 13, 1), (9, 13, 10), (3, 9, 13, 4)))
     )
     answer = method.network(x, mask, features, history)
     assert answer.shape == (9, 13, 3)

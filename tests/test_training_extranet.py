@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 
 import jax
 import jax.numpy as jnp
@@ -204,8 +205,8 @@ def test_shipped_configurations():
 def test_fine_tuning_fits_the_default_weights():
     stated = read_weights(default_weights("guided_net")).config
     options = load_config("guided_net_more").options
-    assert stated == extranet_config(options.network, options.preparation)
-    assert stated == extranet_config(NETWORK, PREPARATION)
+    for network, preparation in ((options.network, options.preparation), (NETWORK, PREPARATION)):
+        assert stated == json.loads(json.dumps(extranet_config(network, preparation)))  # tuples are lists there
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,7 @@ def test_an_example_is_what_the_method_shows_and_the_truth(example):
     np.testing.assert_allclose(made["target"][~sky], np.sqrt(light / (1 + light))[~sky], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_loss_written_out(example):
     task, _, made = example
     model = random_model(SMALL, FRNet)

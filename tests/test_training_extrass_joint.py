@@ -67,7 +67,8 @@ def test_the_answers_and_their_history(model):
     assert not np.any(np.asarray(shown["valid"])[~np.broadcast_to(inside, shown["valid"].shape)])
 
 
-@pytest.mark.parametrize("disoccluded", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("disoccluded", [False, True])
 def test_the_loss_written_out(model, disoccluded):
     options = dataclasses.replace(OPTIONS, disoccluded=disoccluded, temporal_weight=0.7, perceptual_weight=0.3)
     task, given = ExtraSSTask(options), batch()

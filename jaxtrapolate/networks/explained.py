@@ -12,12 +12,15 @@ from jaxtyping import Array, Bool, Float
 
 GAIN = 2.0
 TOLERANCE = 0.02
+CONTRADICTED = 2.0  # of logarithms: light that is seven times another
 _TILE = 16  # pixels
+_RINGS = 4  # pixels
 
 
-def _widened(image: Float[Array, "h w 1"]) -> Float[Array, "h w 1"]:
-    """The largest value among a pixel and its eight neighbours."""
-    return jax.lax.reduce_window(image, -jnp.inf, jax.lax.max, (3, 3, 1), (1, 1, 1), "SAME")
+def _widened(image: Float[Array, "h w 1"], reach: int = 1) -> Float[Array, "h w 1"]:
+    """The largest value among a pixel and those up to `reach` from it, by default its eight neighbours."""
+    size = 2 * reach + 1
+    return jax.lax.reduce_window(image, -jnp.inf, jax.lax.max, (size, size, 1), (1, 1, 1), "SAME")
 
 
 def explained(
@@ -29,7 +32,9 @@ def explained(
     """A network's correction, held within what its inputs differ by around a pixel.
 
     At most `GAIN` times the largest difference between two inputs among a pixel and its eight neighbours, plus
-    `TOLERANCE`: where shading moves, the inputs differ, and where they agree there is nothing to correct.
+    `TOLERANCE`: where shading moves, the inputs differ, and where they agree there is nothing to correct. Up to 4
+    pixels from a difference of `CONTRADICTED` less, and of twice that `TOLERANCE` alone: no shading differs so much,
+    one of the inputs shows a lamp where another does not, and the answer rings around it.
 
     Args:
         correction: what is added to a first guess, in the domain of the inputs: logarithms, or display values.
@@ -41,7 +46,8 @@ def explained(
     """
     stacked = jnp.stack([image.astype(correction.dtype) for image in inputs])
     spread = jnp.max(jnp.max(stacked, 0) - jnp.min(stacked, 0), -1, keepdims=True)
-    limit = GAIN * _widened(spread) + TOLERANCE
+    believed = jnp.clip(2 - _widened(spread, _RINGS) / CONTRADICTED, 0, 1)
+    limit = GAIN * _widened(spread) * believed + TOLERANCE
     held = jnp.where(correction > limit, limit, jnp.where(correction < -limit, -limit, correction))
     return held if free is None else jnp.where(free, correction, held)
 
