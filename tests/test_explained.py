@@ -114,8 +114,8 @@ def test_a_lamp_does_not_ring():
 def test_beside_a_lamp_the_wall_is_as_it_was(name, lamp):
     """One to four pixels from it, and in it: motion by whole pixels is no mean of both.
 
-    Both methods fetch after a tone curve, in which the guided warp mixes a lamp with like pixels beside it; and what the
-    network may say where its inputs agree is 46 dB.
+    Both methods fetch after a tone curve, in which the guided warp mixes a lamp with like pixels beside it; and what
+    the network may say where its inputs agree is 46 dB.
     """
     frames = [lit(time, lamp=lamp, albedo=True)[0] for time in range(6)]
     history = tuple(frame if time % 2 == 0 else without_color(frame) for time, frame in enumerate(frames[:5]))
