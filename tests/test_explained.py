@@ -109,6 +109,21 @@ def test_a_lamp_does_not_ring():
     assert np.abs(np.log1p(image) - np.log1p(truth))[wall].max() < 0.1
 
 
+def test_around_a_contradiction_next_to_nothing_is_believed():
+    """Up to 4 pixels from where inputs differ by 4, which no shading does; beyond it they say what they may."""
+    first = jnp.full((13, 15, 1), 0.5)
+    second = first + 0.25
+    for apart, inside in ((4.0, 0.02), (3.0, 0.02 + 0.5 * 0.5), (2.0, 0.52)):
+        other = second.at[6, 7].set(0.5 + apart)
+        held = np.asarray(explained(jnp.full((13, 15, 1), 9.0), (first, other)))[..., 0]
+        near = np.zeros((13, 15), bool)
+        near[2:11, 3:12] = True
+        touching = np.zeros((13, 15), bool)
+        touching[5:8, 6:9] = True
+        np.testing.assert_allclose(held[near & ~touching], inside, rtol=1e-5)
+        np.testing.assert_allclose(held[~near], 0.52, rtol=1e-5)
+
+
 @pytest.mark.parametrize("lamp", [*slow(1.0, 100.0), 3e4])
 @pytest.mark.parametrize("name", ["guided_warp", "guided_net"])
 def test_beside_a_lamp_the_wall_is_as_it_was(name, lamp):
