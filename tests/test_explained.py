@@ -124,21 +124,17 @@ def test_around_a_contradiction_next_to_nothing_is_believed():
         np.testing.assert_allclose(held[~near], 0.52, rtol=1e-5)
 
 
-@pytest.mark.parametrize("lamp", [*slow(1.0, 100.0), 3e4])
+@pytest.mark.parametrize("lamp", [1.0, *slow(100.0), 3e4])
 @pytest.mark.parametrize("name", ["guided_warp", "guided_net"])
 def test_beside_a_lamp_the_wall_is_as_it_was(name, lamp):
-    """One to four pixels from it, and in it: motion by whole pixels is no mean of both.
-
-    Both methods fetch after a tone curve, in which the guided warp mixes a lamp with like pixels beside it; and what
-    the network may say where its inputs agree is 46 dB.
-    """
+    """One to four pixels from it, and in it: motion by whole pixels is no mean of both."""
     frames = [lit(time, lamp=lamp, albedo=True)[0] for time in range(6)]
     history = tuple(frame if time % 2 == 0 else without_color(frame) for time, frame in enumerate(frames[:5]))
     method = jx.load(name)
     image = method(history[-(2 * method.past - 1) :], without_color(frames[5]))
     on = lit(5)[1]
     near = np.any([np.roll(on, (j, i), (0, 1)) for j in range(-4, 5) for i in range(-4, 5)], 0)
-    assert psnr(image, frames[5].color, near) > {"guided_warp": 50, "guided_net": 45}[name]
+    assert psnr(image, frames[5].color, near) > {"guided_warp": 50, "guided_net": 60}[name]
 
 
 def test_a_still_lamp_is_interpolated_exactly():

@@ -325,12 +325,14 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
             plain = in_space(preparation.space, partial(composite, values), values["newest"].color)
         return {"image": jnp.where(values["target"].gbuffer.sky > 0.5, plain.astype(image.dtype), image)}
 
+    # asked in linear light, in which a lamp that was divided spoils all around it: there nothing is to be divided
+    doubt = dataclasses.replace(preparation, space="linear")
     past = max(1, config.histories)
     stages = (
         reproject_stage(past),
         holes_stage(preparation.taps, position_threshold=preparation.position_threshold),
         dataclasses.replace(OCCLUSION, optional=True),
-        *((hindsight_stage(preparation),) if guided else ()),
+        *((hindsight_stage(doubt),) if guided else ()),
         demodulate_stage(preparation),
         Stage("warp", warp, ("layers", "motions"), ("histories", "warped")),
         *guided,
