@@ -9,7 +9,8 @@ from jaxtrapolate.commands.inputs import add_fresh, check_count, open_methods, p
 from jaxtrapolate.commands.tables import print_table
 
 METHODS = ("repeat", "warp", "guided_warp", "guided_net", "blend", "bidirectional_image", "bidirectional_guided")
-"""What the demo compares: from simple to best, of both kinds. `jaxtrapolate evaluate scenes:demo` runs every method."""
+"""What the demo compares: from simple to best, of both kinds. `jaxtrapolate evaluate scenes:demo` runs every method and
+times its stages, too, which takes minutes of compilation."""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -18,7 +19,8 @@ def add_parser(subparsers: Any) -> None:
         "demo",
         help="a few methods on an embedded scene: table, pictures, HTML report; needs no data",
         description="Renders a small embedded scene and evaluates some methods on it, from the simplest to the best. "
-        "No data, no network. `jaxtrapolate evaluate scenes:demo --output DIR` runs every method.",
+        "No data, no network. `jaxtrapolate evaluate scenes:demo --output DIR` runs every method, "
+        "stage by stage, too.",
     )
     parser.add_argument("--output", default="demo", metavar="DIR", help="for results, pictures and report (demo)")
     parser.add_argument("--frames", type=int, default=16, metavar="N", help="how many frames (16)")
@@ -37,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     methods, unavailable = open_methods(METHODS)
     console = terminal(stderr=True)
     with steps(console) as step:
-        request = Request(methods, unavailable, fresh=options.fresh)
+        request = Request(methods, unavailable, fresh=options.fresh, stages=False)
         results = evaluate_into(sequence, request, folder, step=step)
     print_table(results, terminal())
     console.print(

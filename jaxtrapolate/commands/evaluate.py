@@ -77,6 +77,12 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--frames", metavar="N,N,...", help="score only these held-back frames")
     parser.add_argument("--pictures", type=int, default=2, metavar="N", help="frames shown in the report (default 2)")
+    parser.add_argument(
+        "--no-stages",
+        dest="stages",
+        action="store_false",
+        help="do not time the stages of methods one by one: about half of the compilation",
+    )
     Video.add_arguments(parser)
     add_fresh(parser)
     parser.set_defaults(run=run)
@@ -98,6 +104,7 @@ class Request:
         pictures: how many frames the report shows.
         video: what video is wanted, if any.
         fresh: whether what an earlier run wrote is deleted.
+        stages: whether each stage of a method is timed on its own, too, which compiles it once more.
     """
 
     methods: Mapping[str, Method]
@@ -110,6 +117,7 @@ class Request:
     pictures: int = 2
     video: Video | None = None
     fresh: bool = False
+    stages: bool = True
 
     def settings(self, sequence: Sequence) -> dict[str, Any]:
         """What the results depend on, besides the content of the input and the machine."""
@@ -123,6 +131,7 @@ class Request:
             "numbers": [*sequence.numbers[:1], *sequence.numbers[-1:], len(sequence.numbers)],
             "frames": None if self.frames is None else list(self.frames),
             "pictures": self.pictures,
+            "stages": self.stages,
             "video": None if self.video is None else f"{self.video.path.name}, {self.video.fps:g} fps",
         }
 
@@ -146,6 +155,7 @@ def run(options: argparse.Namespace) -> int:
         options.pictures,
         video,
         options.fresh,
+        options.stages,
     )
     folder = Path(options.output)
     if len(inputs) == 1:
@@ -209,7 +219,11 @@ def evaluate_into(sequence: Sequence, request: Request, folder: Path, *, reuse: 
         gallery = Gallery(output.folder, hdr=sequence.hdr)
         pictured = request.pictures > 0 or request.video is not None or _of_clips(request.metrics)
         results = evaluation.run(
-            kept=kept, gallery=gallery if pictured else None, keep_all=request.video is not None, step=step
+            kept=kept,
+            gallery=gallery if pictured else None,
+            keep_all=request.video is not None,
+            stages=request.stages,
+            step=step,
         )
         settings = {**results.settings, **request.settings(sequence)}
         results = dataclasses.replace(results, settings=settings)

@@ -194,6 +194,7 @@ class Evaluation:
         kept: Scores | None = None,
         gallery: Gallery | None = None,
         keep_all: bool = False,
+        stages: bool = True,
         step: Step = _silent,
     ) -> Results:
         """Scores what has not been scored yet.
@@ -202,12 +203,13 @@ class Evaluation:
             kept: the scores of an earlier run, and where those of this one are kept.
             gallery: keeps a picture of what is generated.
             keep_all: whether it has to hold every frame at the end; else those that were scored before may be missing.
+            stages: whether each stage is timed on its own, too, which compiles it once more.
             step: told how far the work is.
         """
         if gallery is None and any(m.per == "clip" for m in self.metrics.values()):
             with tempfile.TemporaryDirectory() as folder:
                 gallery = Gallery(Path(folder), hdr=self.sequence.hdr)
-                return self.run(kept=kept, gallery=gallery, keep_all=keep_all, step=step)
+                return self.run(kept=kept, gallery=gallery, keep_all=keep_all, stages=stages, step=step)
         kept = Scores(None, self.metrics) if kept is None else kept
         scores = {number: kept.frame(number) for number in (*self.numbers, *self.rendered)}
         clips = kept.clips(list(self.numbers))
@@ -231,7 +233,7 @@ class Evaluation:
                     kept.compile[name] = RunTime(compile=result.compile_ms, cached=result.cached)
                 if gallery is not None:
                     gallery.put(name, window, result.image)
-                if name not in kept.stages:
+                if stages and name not in kept.stages:
                     step(f"time stages of {name}", sum(n < number for n in self.numbers), total)
                     timings = time_stages(self.methods[name], window, carry=result.carry)
                     kept.stages[name] = {
