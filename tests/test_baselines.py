@@ -82,6 +82,7 @@ def test_still_frames_are_returned(methods, name):
     assert np.array_equal(image, frame.color)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ONWARD)
 def test_a_still_frame_is_returned(methods, name):
     frame = replace(make_frame(1, SIZE), motion=np.zeros((*SIZE, 2), np.float32))
@@ -96,6 +97,7 @@ def test_translation_is_exact_between(methods, name):
     np.testing.assert_allclose(np.asarray(methods[name](history, target, future))[inner], truth[inner], atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ONWARD)
 def test_translation_is_exact_onward(methods, name):
     history, target, _ = given(name, sliding)
@@ -103,6 +105,7 @@ def test_translation_is_exact_onward(methods, name):
     np.testing.assert_allclose(np.asarray(methods[name](history, target))[inner], sliding(3).color[inner], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_translation_is_found_by_optical_flow(methods):
     image = methods["dis"](*given("dis", sliding, (48, 64)))
     truth = sliding(0.5, (48, 64)).color
@@ -113,6 +116,7 @@ def test_translation_is_found_by_optical_flow(methods):
     assert error < 0.1 * naive
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["grid_warp", "warp_3d", *slow("softmax_splat", "grid_extrapolate")])
 def test_a_box_before_a_wall(methods, name):
     """The box arrives whole; the wall away from it is untouched; the uncovered wall is not the box."""
@@ -271,6 +275,7 @@ def test_cameras_tell_the_motion_of_what_is_static(methods, name, moving):
 # All of them
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in HEAVY else n for n in NAMES])
 def test_compiled_whole_is_stage_by_stage(methods, name):
     frames = given(name)
@@ -279,6 +284,7 @@ def test_compiled_whole_is_stage_by_stage(methods, name):
     assert np.isfinite(image).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "size", [(1, 1), pytest.param((1, 7), marks=pytest.mark.slow), pytest.param((13, 11), marks=pytest.mark.slow)]
 )
@@ -319,6 +325,7 @@ def test_what_is_missing_is_named(methods, name):
         assert np.isfinite(methods[name](bare, target, following)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_colour_and_motion_are_enough(methods, name):
     history, target, future = given(name)
@@ -338,6 +345,7 @@ def test_frames_without_colour_in_the_future_are_chained_through(methods):
     np.testing.assert_allclose(image[inner], sliding(0.5).color[inner], atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["half_motion", pytest.param("softmax_splat", marks=pytest.mark.slow), "warp_3d"])
 def test_gradients_are_finite_and_there(methods, name):
     history, target, future = given(name)

@@ -62,6 +62,7 @@ def color(path):
     return np.stack([channels[c] for c in "RGB"], -1)
 
 
+@pytest.mark.slow
 def test_generate_never_passes_off_another_methods_frames(capsys, still_dump, tmp_path):
     output, apart = tmp_path / "g", tmp_path / "apart"
     common = ("generate", still_dump, "--output", output)
@@ -124,6 +125,7 @@ def test_render_never_mixes_seeds(capsys, tmp_path, monkeypatch):
     assert open_sequence(tmp_path / "dump").numbers == (0, 1, 2)
 
 
+@pytest.mark.slow
 def test_evaluate_knows_its_input(capsys, dump, tmp_path):
     common = ("evaluate", dump, "--methods", "repeat", "--pictures", 0, "--output")
     assert run(capsys, *common, tmp_path / "a")[0] == 0
@@ -148,6 +150,7 @@ def test_a_copied_input_is_the_same(capsys, still_dump, tmp_path, monkeypatch):
     assert run(capsys, "evaluate", copy, *arguments)[0] == 0
 
 
+@pytest.mark.slow
 def test_one_method_more_keeps_the_scores_of_the_others(capsys, still_dump, tmp_path, monkeypatch):
     asked, real = [], module.score_window
 
@@ -197,6 +200,7 @@ def test_kept_scores_of_another_shape_are_computed_again(capsys, still_dump, tmp
     assert "0001.json: is a folder" in refused(capsys, *common)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_several_frames_missing_in_a_row(capsys, tmp_path, last):
     """Motion leads from frame to frame: all of them are handed over, as in Python."""

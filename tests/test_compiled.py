@@ -42,6 +42,7 @@ def evaluate(environment, dump, folder, *options):
     return json.loads((folder / "results.json").read_text()), ended.stdout
 
 
+@pytest.mark.slow
 def test_a_second_run_reads_what_the_first_compiled(environment, dump, tmp_path):
     first, _ = evaluate(environment, dump, tmp_path / "a")
     kept = list((tmp_path / "cache" / "jaxtrapolate" / "compiled").iterdir())

@@ -41,6 +41,7 @@ def test_corrections_are_held_by_a_loop():
     np.testing.assert_allclose(jax.vmap(explained)(*pairs)[1], single, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_of_corrections_are_finite():
     correction, images = jnp.asarray(random(*SHAPE)), tuple(map(jnp.asarray, random(3, *SHAPE, seed=1)))
     for given in (images, (jnp.zeros(SHAPE),) * 3):
@@ -95,6 +96,7 @@ def without_color(frame):
     return replace(frame, color=None)
 
 
+@pytest.mark.slow
 def test_a_lamp_does_not_ring():
     """From two pixels beside it on all that the network sees agrees, and so does its answer, but for its tolerance."""
     frames = [lit(time, lamp=3e4)[0] for time in range(6)]
@@ -125,7 +127,7 @@ def test_around_a_contradiction_next_to_nothing_is_believed():
 
 
 @pytest.mark.parametrize("lamp", [1.0, *slow(100.0), 3e4])
-@pytest.mark.parametrize("name", ["guided_warp", "guided_net"])
+@pytest.mark.parametrize("name", ["guided_warp", *slow("guided_net")])
 def test_beside_a_lamp_the_wall_is_as_it_was(name, lamp):
     """One to four pixels from it, and in it: motion by whole pixels is no mean of both."""
     frames = [lit(time, lamp=lamp, albedo=True)[0] for time in range(6)]
@@ -158,6 +160,7 @@ def glowing(time, size=(56, 88)):
     return jax.tree.map(jnp.asarray, jx.Frame(np.float32(color), buffers, motion, time=float(time))), panel
 
 
+@pytest.mark.slow
 def test_the_edges_of_what_shines_do_not_break():
     """No guide says where a panel ends: beside its edges the guided warp is the composite, which fetches bilinearly."""
     frames = [glowing(time)[0] for time in range(6)]
@@ -175,6 +178,7 @@ def test_the_edges_of_what_shines_do_not_break():
     assert decibels("guided_warp") > decibels("occlusion_warp") - 0.3
 
 
+@pytest.mark.slow
 def test_no_texture_is_printed_on_what_shines():
     """Inside panels the network is not behind the guided warp, whose first guess would print the albedo there."""
     frames = [glowing(time)[0] for time in range(6)]

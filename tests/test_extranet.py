@@ -148,6 +148,7 @@ def test_the_network_is_shown_what_the_facts_say(methods, name, rendered):
         np.testing.assert_allclose(found[part], value, rtol=2e-4, atol=2e-4, err_msg=part)
 
 
+@pytest.mark.slow
 def test_the_release_of_one_pixel(methods):
     history, target = make_window((1, 1))
     for name in ("ours", "release"):

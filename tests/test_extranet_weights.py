@@ -63,6 +63,7 @@ def test_the_papers_network_has_no_default_weights_and_is_no_default():
     assert "guided_net" in BEST_FIRST
 
 
+@pytest.mark.slow
 def test_a_network_of_our_own_is_loaded_by_its_name(model, tmp_path):
     """The same stages and weights under both names, and neither takes the other's files."""
     config, tree = module.extranet_config(model.config, PREPARATION), nnx.to_pure_dict(nnx.state(model))

@@ -101,6 +101,7 @@ def test_feature_difference_against_the_formula():
     np.testing.assert_allclose(feature_difference_loss(*arrays), relative, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_smaller_features_are_no_better():
     """As printed a thousandth of all features is a thousandth of the loss; relative, the same, and no slope there."""
     arrays = [[*map(jnp.asarray, a)] for a in (levels(), levels(5))]

@@ -150,6 +150,7 @@ def test_without_a_residual_it_is_the_upsampled_input(generated):
     np.testing.assert_allclose(found.image, upsample(given[0], jitter=given[3]), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_each_kind_of_frame_has_an_encoder_and_both_one_decoder():
     model = random_model(SAMPLER, ExtraSSNet)
 

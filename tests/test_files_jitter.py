@@ -54,6 +54,7 @@ def test_the_same_jitter_in_any_convention(dump, stated, factor, separator):
         np.testing.assert_allclose(found, jitter_of(number), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_what_jitter_is_worth(dump, capsys):
     """The pattern is the same but for where it is sampled, which a warp only knows by the file."""
     unaware, plain = jx.evaluate(dump, ["warp"]).methods["warp"].psnr, open_sequence(dump)
@@ -88,6 +89,7 @@ def test_files_that_cannot_be_used(dump, toml, lines, message):
         open_sequence(dump)
 
 
+@pytest.mark.slow
 def test_embedded_scenes_on_the_command_line(tmp_path, capsys):
     (given,) = named_inputs(["scenes:walkers"], size="32x18", length=3, scale=2, jitter=True)
     sequence = given.open()

@@ -196,6 +196,7 @@ class Stepped(SyntheticSequence):
         return make_keyframe((number - 5) // 3, self.size)
 
 
+@pytest.mark.slow
 def test_windows_go_by_position():
     sequence = Stepped([5, 8, 11, 14, 17, 20, 29, 32])
     assert held_back(sequence, past=1) == [8, 14, 20, 32]

@@ -156,6 +156,7 @@ def test_the_frame_between_from_backward_motion_alone():
     np.testing.assert_allclose(row[[0, 1, 2, 20, 23]], 0.15, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_jit_vmap_and_gradients():
     previous, next, _ = backward_only()
 

@@ -255,6 +255,7 @@ def gradients(image, motion, *, filter="bilinear", value=None, cotangent=None):
     return np.asarray(result), [np.asarray(g) for g in found]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "filter, size",
     [
@@ -289,6 +290,7 @@ def test_zero_motion_gradient(x64, filter):
         np.testing.assert_allclose(found[..., along], expected, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", SIZES[1:], ids=str)
 def test_zero_motion_gradient_of_small_images(x64, size):
     _, (image, motion, _) = gradients(random(*size, 2), np.zeros((*size, 2)), value=0.0)

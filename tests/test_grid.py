@@ -24,6 +24,7 @@ def ramp(size):
     return np.stack([0.1 * x + 0.03 * y, 0.02 * x - 0.07 * y, np.ones_like(x)], -1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cell", [3, 8])
 @pytest.mark.parametrize("size", [*SIZES[:2], *(pytest.param(s, marks=pytest.mark.slow) for s in SIZES[2:])])
 def test_no_flow_returns_the_image(size, cell):

@@ -193,6 +193,7 @@ def test_gradients_against_differences_of_the_loop(x64):
     oracles.assert_gradients(loss, arrays, [np.asarray(g) for g in found], step=1e-7, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.05, 1e-3, 1e-12, 1e-20])
 def test_gradients_stay_finite(sigma):
     image, motion, target, source = small()

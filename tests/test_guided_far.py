@@ -66,6 +66,7 @@ def test_only_unlike_holes_move():
     np.testing.assert_array_equal(far_motion(motion, target, np.full_like(source, np.nan), holes, step=2), motion)
 
 
+@pytest.mark.slow
 def test_bad_motion_stays_in_its_block():
     motion, target, source, holes = inputs(12, 18)
     spoilt = motion.copy()
@@ -77,6 +78,7 @@ def test_bad_motion_stays_in_its_block():
     assert np.isfinite(warped).all()
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_the_motion():
     motion, target, source, holes = inputs(8, 10)
     weights = random(8, 10, 2, seed=9)

@@ -256,6 +256,7 @@ def test_soft_masks_become_hard(x64):
     np.testing.assert_allclose(masks.any, 1 - np.prod([1 - p for p in parts], axis=0), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_soft_gradients_are_finite(x64):
     motion = random_motion(*SIZE)
     motion[0, 0], motion[1, 1], motion[2, 2] = np.nan, np.inf, 1e6

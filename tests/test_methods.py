@@ -84,6 +84,7 @@ def test_a_rendered_target_is_returned(methods, name):
     assert np.array_equal(methods[name](history, replace(target, color=truth)), truth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_one_frame_of_history_is_enough(methods, name):
     history, target, truth = window()
@@ -191,6 +192,7 @@ def test_what_stands_still_stays_as_it_is(methods, name):
     assert np.array_equal(methods[name]((frame, hide(frame), frame), hide(frame)), frame.color)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "size", [(1, 1), *(pytest.param(s, marks=pytest.mark.slow) for s in ((1, 7), (13, 11)))], ids=str
 )

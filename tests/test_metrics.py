@@ -124,6 +124,7 @@ def test_degenerate_images():
     assert np.isfinite(gradient(flat * 0, flat)).all()
 
 
+@pytest.mark.slow
 def test_gradients(x64):
     first, second = (np.float64(a) for a in pair(11, 12))
     along = random(11, 12, 3, seed=6, low=-1, dtype=np.float64)

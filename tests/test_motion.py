@@ -134,6 +134,7 @@ def test_convert_motion_keeps_our_convention_bit_for_bit(loose):
     np.testing.assert_array_equal(jx.convert_motion(jnp.asarray(motion), **ours), motion)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["float16", "bfloat16"])
 def test_convert_motion_keeps_the_dtype(loose, kind):
     motion = jnp.ones((5, 7, 2), kind)

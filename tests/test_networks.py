@@ -318,6 +318,7 @@ def test_what_tells_of_the_guess_comes_last(direct):
         more(x, mask, features, history)
 
 
+@pytest.mark.slow
 def test_direct_is_a_network_with_the_histories_among_its_features():
     """The same weights, the histories appended to the target's buffers, oldest first."""
     direct = ExtraNet(ExtraNetConfig(widths=(3, 4), features=2, histories=2, direct=True), rngs=nnx.Rngs(0))
@@ -440,6 +441,7 @@ def test_a_training_step_reaches_every_parameter():
     assert all(jax.tree.leaves(moved))
 
 
+@pytest.mark.slow
 def test_no_implicit_promotion(strict):
     arrays = device([a[None] for a in inputs(5, 7, SMALL)])
 

@@ -27,6 +27,7 @@ def test_the_derivative_of_a_quotient(scale):
     np.testing.assert_array_equal(nothing, [0, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-30, 1e-15, 1.0, 1e25])
 def test_shares(scale):
     part, rest = np.float32([0, 0.2, 3, 1e-3]) * np.float32(scale), np.float32([1, 0.7, 0, 2]) * np.float32(scale)
@@ -73,6 +74,7 @@ def material():
     return jx.GBuffer(albedo=random(H, W, 3, seed=2), specular=one, roughness=one, n_dot_v=one)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("apart", [0, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3])
 def test_hindsight_has_finite_gradients_where_nothing_errs(apart):
     """A still scene, and frames that are nearly alike: fourth powers of small errors underflow."""
@@ -148,6 +150,7 @@ def test_relative_depth_against_float64():
     np.testing.assert_allclose(relative_depth(jnp.asarray(depth), None), expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_bfloat16_colours_are_searched_for_in_float32():
     """Bright colours: the inverse of the curve they are blended in has no digits left near 1 in bfloat16."""
     flow = jnp.zeros((H, W, 2))

@@ -121,6 +121,7 @@ def test_neither_is_worse_than_opencvs_on_scenes(scene, seed):
     assert ours <= distance(opencv_farneback(newer, older), exact) + 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(1, 1), (5, 7), *slow((1, 6), (6, 1))])
 @pytest.mark.parametrize("name", FLOWS)
 def test_still_images_have_no_flow(name, size):
@@ -152,6 +153,7 @@ def test_what_is_not_finite_stays_local(name):
     assert np.isfinite(FLOWS[name](np.full_like(first, np.nan), second)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["farneback", *slow("dis")])
 @pytest.mark.parametrize("dtype", [jnp.bfloat16, *slow(jnp.float16)])
 def test_half_precision_is_computed_in_float32(name, dtype):
@@ -245,6 +247,7 @@ def test_an_unknown_preset():
 # Resampling
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(20, 31), (7, 50), (41, 62), (1, 1)])
 @pytest.mark.parametrize("kind, flag", [("linear", cv2.INTER_LINEAR), ("area", cv2.INTER_AREA)])
 def test_another_size_is_opencvs(size, kind, flag):

@@ -96,6 +96,7 @@ def test_values_are_held_as_the_field_has_them():
     assert [type(values[n]) for n in ("floor", "sigma_space")] == [float, float]
 
 
+@pytest.mark.slow
 def test_numbers_change_without_compiling_anew():
     method, traces = jx.load("occlusion_warp"), []
     first, *rest = method.stages
@@ -137,6 +138,7 @@ def test_options_are_swept_and_fitted():
     assert slope != 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options"),
     [
@@ -181,6 +183,7 @@ def loaded(name):
 # Precision
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "dtype", "least"),
     [
@@ -222,6 +225,7 @@ def test_what_is_cast():
     assert newest.motion.dtype == np.float32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n in jx.method_names() if n not in NETWORKS])
 def test_every_method_in_bfloat16(unchecked, name, strict):
     """No buffer of one dtype meets one of another unawares."""

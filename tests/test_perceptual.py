@@ -114,6 +114,7 @@ def test_vgg_features_against_a_loop():
     np.testing.assert_allclose(pixel, convolve(shifted, *weights.layers[0], 1, 1), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("net", SLOW_VGG)
 def test_lpips_gradient(x64, net):
     size, weights = (31, 33), tiny(net)
@@ -159,6 +160,7 @@ def test_lpips_gradient_is_finite_where_features_are_equal_or_dark(net):
 # With the weights
 
 
+@pytest.mark.slow
 @NEEDS["lpips"]
 @pytest.mark.parametrize("net, theirs", [pytest.param("vgg", "vgg16", marks=pytest.mark.slow), ("alex", "alexnet")])
 @pytest.mark.filterwarnings("ignore")  # it leaves its file open

@@ -23,6 +23,7 @@ def grid(size):
     return np.stack([x, y], -1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["interior", *slow("forest")])
 def test_fitted_to_a_scene(name):
     """To a hundredth of a pixel where its own camera shows the points, at another time too."""

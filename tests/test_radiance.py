@@ -147,6 +147,7 @@ def test_special_values():
     np.testing.assert_allclose(radiance.srgb_encode(jnp.asarray([-0.01])), [-0.1292])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["log_encode", "log_decode", "tonemap", "tonemap_inverse", "srgb_encode", "srgb_decode"]
 )

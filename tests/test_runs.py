@@ -107,6 +107,7 @@ def test_other_lights_compile_nothing():
 # Motion blur
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(H, W), pytest.param((1, 1), marks=pytest.mark.slow)], ids=str)
 def test_a_closed_shutter_returns_the_frame_bit_for_bit(size):
     frames = three(size=size, flow=(1.3, -0.7, 0.1))
@@ -141,6 +142,7 @@ def test_whole_pixels_and_attributes():
     np.testing.assert_allclose(blurred[inside], expected[inside], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shutter, least",
     [(0.5, 41.0), pytest.param(1.0, 42.0, marks=pytest.mark.slow), pytest.param(2.0, 45.0, marks=pytest.mark.slow)],
@@ -163,6 +165,7 @@ def bars():
     return first, jx.replace(second, forward_flow=flows[1]), jx.replace(third, color=third.color + jnp.float32(0.1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("assisted", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_bar_before_a_wall(assisted):
     """Half an interval before the bar is at 7..14, then at 10..17, half an interval after it at 13..20."""

@@ -223,6 +223,7 @@ def gradients(values, motion, weights, mode, cotangent):
     return np.asarray(result), [np.asarray(g) for g in found]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode, size", [(mode, (5, 7)) for mode in MODES] + [("average", (1, 1))])
 def test_gradients_against_differences_of_the_loop(x64, mode, size):
     values, motion = random(*size, 2, dtype=np.float64), random_motion(*size, amount=1, dtype=np.float64)

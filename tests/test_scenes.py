@@ -204,6 +204,7 @@ def test_motion_of_dynamic_surfaces_is_that_of_their_bodies(scene, frame, before
     assert error[frame.gbuffer.stencil[..., 0] > 0].max() < 0.02
 
 
+@pytest.mark.slow
 def test_scenes_have_as_many_object_matrices():
     """What is compiled for frames of one scene fits those of another."""
     shapes = set()
@@ -305,6 +306,7 @@ def test_shadow_is_what_dynamic_objects_block_of_the_sun(scene, frame):
     assert (flat(np.asarray(lit.color))[expected].sum(-1) > flat(frame.color)[expected].sum(-1)).all()
 
 
+@pytest.mark.slow
 def test_flow_there_and_back(scene):
     """The point where a surface lands flows back to where it came from, where the grid meets it exactly enough."""
     ahead = np.asarray(flow(scene, TIME, TIME + 2, size=SIZE))

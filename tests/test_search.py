@@ -179,6 +179,7 @@ def test_a_change_of_depth_that_is_not_finite_counts_as_none():
     np.testing.assert_array_equal(error, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_extreme_flow(solver):
     @jax.jit
@@ -198,6 +199,7 @@ def test_extreme_flow(solver):
         assert all(np.isfinite(g).all() for g in gradient(jnp.asarray(flow), jnp.float32(0.5)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["float16", "bfloat16", "float64"])
 def test_dtypes(x64, kind):
     flow = jnp.asarray(random(3, 500, 3, low=-2, high=2), kind)
@@ -207,6 +209,7 @@ def test_dtypes(x64, kind):
     np.testing.assert_allclose(found.position, expected[0], atol=1e-9 if kind == "float64" else 2e-3)
 
 
+@pytest.mark.slow
 def test_jit_vmap_and_eager_agree():
     flows = np.stack([smooth_flow(20, 6), 0.5 * smooth_flow(20, 6)])
     fractions = np.float32([0.3, 0.8])
@@ -251,6 +254,7 @@ def derivatives(solver, iterations):
     return both
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver, iterations", [pytest.param("fixed_point", 120, marks=pytest.mark.slow), ("newton", 8)]
 )
@@ -286,6 +290,7 @@ def test_the_gradient_does_not_depend_on_how_the_answer_was_found(x64):
     np.testing.assert_array_equal(from_start, 0)
 
 
+@pytest.mark.slow
 def test_second_derivatives(x64):
     """Of one smooth cell, against differences of the gradient."""
     flow = affine_flow(5, 6, [[0.2, 0.1], [-0.1, 0.15]], [0.31, 0.17])
@@ -391,6 +396,7 @@ def latest_loop(offset, depth, ratio, reach):
 QUICK = [((1, 6), 0), ((1, 1), 1), ((5, 7), 2)]  # each reach, and the sizes where it ends at once
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "size, reach",
     [

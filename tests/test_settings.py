@@ -315,6 +315,7 @@ def given(found, *, times=float, dtype=np.float32):
     return tuple(sequence[place - past : place]), sequence[place], tuple(sequence[place + 1 : place + 1 + future])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", jx.method_names())
 def test_methods_keep_float32(unchecked, name):
     """Also with times in float64."""
@@ -492,6 +493,7 @@ def evaluate(folder):
     assert main(["evaluate", str(dump), "--methods", "repeat,warp", "--output", str(folder / "results")]) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", ["evaluate", *slow("train, evaluate", "draw, train, evaluate")])
 def test_a_process_with_all_settings(tmp_path, steps):
     """By environment variables, as users set them; against a process without."""

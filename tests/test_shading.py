@@ -105,6 +105,7 @@ def test_a_silhouette_stays():
     assert difference(made, truth, all_of_it) < without + 1e-6
 
 
+@pytest.mark.slow
 def test_holes_have_no_weight():
     """What stands in a hole changes nothing outside, and there is no flow in it."""
     newer, older = pair()
@@ -146,6 +147,7 @@ def test_other_resolutions(finest):
     assert difference(made, truth, edge) < 0.5 * difference(newer, truth, edge)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "size", [(1, 1), *(pytest.param(s, marks=pytest.mark.slow) for s in ((5, 7), (1, 7), (6, 1), (33, 17)))]
 )

@@ -156,6 +156,7 @@ def between(alpha_of=0):
     return history, target, (frame(1),), truth
 
 
+@pytest.mark.slow
 def test_light_between_two_frames():
     history, target, future, truth = between()
     before, after = (

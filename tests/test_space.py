@@ -51,6 +51,7 @@ def test_what_is_fetched_unmixed(space):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("name", [*FAST, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
 def test_the_option(name, space):
@@ -71,6 +72,7 @@ def test_the_option(name, space):
     np.testing.assert_allclose(answers[id(moving)], linear, atol=0.25)
 
 
+@pytest.mark.slow
 def test_every_fetch_of_a_method_is_in_its_space():
     """A picture of two values, a pixel wide each, moved by half a pixel, demodulated or not: the same light between.
 

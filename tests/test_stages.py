@@ -248,6 +248,7 @@ OPTIONAL = [(name, s.name) for name in default_methods() for s in jx.load(name).
 LONG = ("guided_net", "bidirectional_guided", "shading_warp", "bidirectional_shading")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "left_out"), [pytest.param(*p, marks=pytest.mark.slow) if p[0] in LONG else p for p in OPTIONAL]
 )
@@ -295,6 +296,7 @@ def test_a_stage_runs_where_it_is_needed():
         assert len(runs) == motion
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, stage", [("occlusion_warp", "occlusion motion"), *slow_rows(("guided_net", "network"))])
 def test_what_is_spared_gives_the_same(name, stage):
     """Without the test the image is the same: in frames that stand still, and in frames that do not."""

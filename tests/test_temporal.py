@@ -65,6 +65,7 @@ def test_colours_there_and_back():
     np.testing.assert_allclose(ycocg_to_rgb(rgb_to_ycocg(jnp.asarray(image))), image, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients(x64):
     current, history, valid = images(3, 4, 1)
     arrays = [np.asarray(a, np.float64) for a in (current, history)]
@@ -75,6 +76,7 @@ def test_gradients(x64):
     assert_gradients(lambda *a: np.sum(loop(*a, valid) * share), arrays, gradients, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_flat_neighbourhoods_are_their_colour():
     """A ghost over a flat wall is gone at once, with finite gradients, and the smallest frames are what they are."""
     for size in ((4, 5), (1, 1)):

@@ -53,6 +53,7 @@ def test_what_is_kept(cache):
         assert kept_times() is None
 
 
+@pytest.mark.slow
 def test_the_command_says_where_its_times_come_from(capsys, cache):
     assert main(["methods"]) == 0
     assert "ms: not measured here yet; --measure does" in capsys.readouterr().out

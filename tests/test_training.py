@@ -337,6 +337,7 @@ def test_half_precision(tmp_path):
     assert (weights != weights.astype(jnp.bfloat16).astype(np.float32)).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ahead", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_loss_that_is_not_finite(tmp_path, ahead):
     """The first step that draws the bad example is named; its batch is saved; the checkpoints are of before it."""
@@ -598,6 +599,7 @@ def test_weight_decay_is_decoupled():
         np.testing.assert_allclose(weight, expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", ["before", "while it is written"])
 def test_a_full_disk_is_one_line(tmp_path, monkeypatch, when):
     """Told before Orbax begins, or as the one error of all that its threads report."""

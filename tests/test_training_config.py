@@ -75,6 +75,7 @@ def fails(capsys, *arguments):
     return err
 
 
+@pytest.mark.slow
 def test_command(capsys, tmp_path):
     file = toml(tmp_path / "run.toml")
     assert main(["train", file, "--workdir", str(tmp_path / "run")]) == 0

@@ -33,6 +33,7 @@ def example():
     return task, window, jax.jit(task._prepare)(window, jax.random.key(0))
 
 
+@pytest.mark.slow
 def test_an_example_is_what_the_method_shows_and_the_truth(example):
     task, window, made = example
     method = task._stages

@@ -82,6 +82,7 @@ def test_memory_starts_anew_with_each_window():
     np.testing.assert_allclose(scores["psnr"], decibels(np.full((2, 2), 0.1), np.full((2, 2), 0.2)), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_what_is_left_of_a_window():
     """No method's image changes by what `lean` leaves out."""
     given = make_window()

@@ -158,6 +158,7 @@ def dump(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("together", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_windows_of_dumps(dump, together):
     """Three of eight frames have five before them: every second one counts as rendered; the last is for validation."""
@@ -184,6 +185,7 @@ def test_the_last_tenth_of_a_dump_is_held_back(count, training):
     assert held == (numbers[training:] or numbers)
 
 
+@pytest.mark.slow
 def test_dumps_that_cannot_be(dump, tmp_path):
     def windows(prepare=everything, past=3, **options):
         return Windows(WindowOptions(dumps_share=1.0, **options), prepare, past=past)
@@ -378,6 +380,7 @@ def test_a_network_trained_on_rendered_windows(tmp_path):
     assert len(list((tmp_path / "images").iterdir())) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 def test_bare_windows_have_depth_and_stencil_alone(monkeypatch, share):
     names = ("albedo", "depth", "normal", "stencil")
@@ -399,6 +402,7 @@ def test_bare_windows_have_depth_and_stencil_alone(monkeypatch, share):
     assert abs(np.asarray(made).mean() - share) <= (0.15 if 0 < share < 1 else 0)
 
 
+@pytest.mark.slow
 def test_sparse_windows_lack_one_kind_of_buffer_and_lamps_shine(monkeypatch):
     """In all their frames alike, each kind now and then; and what is bright is brighter in some windows."""
     names = ("albedo", "depth", "normal", "stencil", "position", "roughness", "metallic", "sky")

@@ -82,6 +82,7 @@ def test_scores_causes_and_pictures_at_output_size(tmp_path):
     assert alone.methods["warp"].psnr == pytest.approx(results.methods["warp"].psnr, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_rendered_frames_of_a_method_that_super_samples_are_scored_apart(tmp_path, capsys):
     sequence, calls = Pair(), []
 
@@ -287,6 +288,7 @@ def test_pictures_of_two_sizes_are_png(tmp_path):
     assert read_png(tmp_path / described["methods"]["twice"]["error"]).shape == (64, 96, 3)
 
 
+@pytest.mark.slow
 def test_larger_frames_that_have_changed_are_noticed(tmp_path):
     """What scores depend on, as much as the frames themselves."""
     small, large = dumped(tmp_path / "small", SIZE), dumped(tmp_path / "large", (64, 96))

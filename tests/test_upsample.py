@@ -98,6 +98,7 @@ def test_easu_is_the_published_shader(size, scale):
     np.testing.assert_allclose(easu(jnp.asarray(image), scale=scale), published(image, scale), atol=2e-5)
 
 
+@pytest.mark.slow
 def test_easu_of_what_is_flat_and_of_an_edge():
     """Flat stays flat; a slanted edge is less of a staircase than bilinear makes it, and nothing rings."""
     flat = jnp.full((4, 5, 3), 0.37)
@@ -116,6 +117,7 @@ def test_easu_of_what_is_flat_and_of_an_edge():
     assert easu(small).max() <= 1
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_and_dtypes_stay():
     image = jnp.asarray(random(4, 5, 3))
     for function in (upsample, easu):

@@ -33,6 +33,7 @@ def test_easu_works_after_a_tone_curve():
     np.testing.assert_allclose(found, easu(jnp.asarray(np.float32(compressed(frame.color)))), atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bicubic", *slow("bilinear")])
 def test_another_frame_is_the_guided_warp_upsampled(name):
     history, target = make_window(SIZE, rendered=2)
@@ -62,6 +63,7 @@ def test_the_first_answer_of_taau_and_the_next_against_the_loop():
     np.testing.assert_array_equal(carry.image, second)
 
 
+@pytest.mark.slow
 def test_taa_follows_the_motion():
     """A jittered disc that moves two pixels a frame comes near its coverage, where it is now."""
     rng, size, fine = np.random.default_rng(0), (12, 20), 8

@@ -133,6 +133,7 @@ def test_a_far_sky_is_another_surface_than_a_trunk(far, place, marked):
     assert not jx.hole_masks(sky, sky, jnp.zeros((4, 4, 2))).any.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1.0, 0.01])
 def test_guided_warp_of_color_motion_and_depth_alone(unit):
     """A red box moved aside over a wall of one colour: there the warp repeats the box, the guided warp has the wall."""

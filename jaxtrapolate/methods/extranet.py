@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.checks import check_choice
 from jaxtrapolate.errors import printable
 from jaxtrapolate.methods.hindsight import hindsight_stage
+from jaxtrapolate.methods.memory import remember_stage, start
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import settings
 from jaxtrapolate.methods.seen import Remembered, seen_before_stage
@@ -280,6 +281,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
         guided += (dataclasses.replace(guided_stage(preparation.space), optional=True),)
     if preparation.first_guess == "shading":
         guided += (*light_stages(preparation.space), seen_before_stage(preparation.space))
+    remembers = preparation.first_guess == "shading"
 
     def warp(state, values: Values):
         pairs = zip(values["layers"], values["motions"], strict=True)
@@ -329,6 +331,7 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
     doubt = dataclasses.replace(preparation, space="linear")
     past = max(1, config.histories)
     stages = (
+        *((remember_stage(preparation),) if remembers else ()),
         reproject_stage(past),
         holes_stage(preparation.taps, position_threshold=preparation.position_threshold),
         dataclasses.replace(OCCLUSION, optional=True),
@@ -355,8 +358,8 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
         ),
         SKY,
     )
-    given = _SETTINGS[preparation.first_guess]
-    return Method(name, stages, past=past, weights=weights, settings=given, networks={"network": function})
+    given, begin = _SETTINGS[preparation.first_guess], start if remembers else None
+    return Method(name, stages, past=past, weights=weights, settings=given, networks={"network": function}, start=begin)
 
 
 def first_guess(method: Method) -> Method:

@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import Any
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from jaxtrapolate.records import Frame, replace
 
@@ -29,6 +30,18 @@ def cast(frame: Frame, dtype: Any) -> Frame:
         there = {f.name: getattr(buffers, f.name) for f in dataclasses.fields(buffers) if f.name not in _KEPT}
         given = replace(buffers, **{n: jnp.asarray(v, dtype) for n, v in there.items() if v is not None})
     return replace(frame, color=None if frame.color is None else jnp.asarray(frame.color, dtype), gbuffer=given)
+
+
+def newest_color(history: Frames, target: Frame) -> Array:
+    """The colour of the newest frame that has one, the target included.
+
+    Raises:
+        ValueError: none has.
+    """
+    colors = [frame.color for frame in (*history, target) if frame.color is not None]
+    if not colors:
+        raise ValueError(f"history: expected a frame with colour, got {len(history)} frames without")
+    return jnp.asarray(colors[-1])
 
 
 def rendered(history: Sequence[Frame]) -> list[int]:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.methods.frames import Frames, rendered
 from jaxtrapolate.methods.hindsight import block_sums, from_blocks
+from jaxtrapolate.methods.memory import MISSES, Memory, recall, surfaces_of
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.space import Space, in_space
 from jaxtrapolate.methods.stage import Needed, Stage, Values
@@ -27,7 +28,6 @@ from jaxtrapolate.ops.warp import pixel_grid, sample
 from jaxtrapolate.precision import divide, widest
 from jaxtrapolate.records import Frame, GBuffer, replace
 
-_MISSES = 0.25  # pixels: a frame whose positions no camera explains
 _DARKEST = 1e-3  # light under which a ratio says nothing
 
 
@@ -38,15 +38,6 @@ class Remembered:
     relight: float = option(4.0, "how far the light of older frames follows that around: at most this factor", low=1)
 
 
-def _surfaces(buffers: GBuffer) -> Bool[Array, "h w 1"]:
-    """Where a surface is."""
-    position = cast(Array, buffers.position)
-    there = jnp.all(jnp.isfinite(position), -1, keepdims=True)
-    if buffers.sky is not None:
-        there &= buffers.sky < 0.5
-    return there if buffers.depth is None else there & (buffers.depth < jnp.inf)
-
-
 def _as_it_was(target: GBuffer, moved: Array | None) -> tuple[GBuffer, Bool[Array, "h w 1"]]:
     """The target's surfaces where they were in an older frame, and of which that is known.
 
@@ -54,7 +45,7 @@ def _as_it_was(target: GBuffer, moved: Array | None) -> tuple[GBuffer, Bool[Arra
         target: its buffers.
         moved: `[N, 4, 4]`, for ids 1..N the map of the world now to the world then; `None` = unknown, nothing dynamic.
     """
-    known, stencil = _surfaces(target), target.stencil
+    known, stencil = surfaces_of(target), target.stencil
     if stencil is None:
         return target, known
     if moved is None:
@@ -98,14 +89,14 @@ def seen_at(history: Frames, target: Frame, place: int) -> tuple[Float[Array, "h
     """
     source, buffers = history[place].gbuffer, cast(GBuffer, target.gbuffer)
     source = cast(GBuffer, source)
-    matrix, misses = fitted_projection(source.position, _surfaces(source)[..., 0])
+    matrix, misses = fitted_projection(source.position, surfaces_of(source)[..., 0])
     then, known = _as_it_was(buffers, _moved(history, target, place))
     height, width = then.position.shape[:2]  # type: ignore[union-attr]
     x, y = (jnp.broadcast_to(v, (height, width)) for v in pixel_grid(height, width, matrix.dtype))
     motion = project(matrix, then.position) - jnp.stack([x, y], -1)
     ahead = jnp.all(jnp.isfinite(motion), -1, keepdims=True)
     motion = jnp.where(ahead, motion, 0)
-    seen = known & ahead & (misses < _MISSES) & ~find_holes(then, replace(source, stencil=None), motion)
+    seen = known & ahead & (misses < MISSES) & ~find_holes(then, replace(source, stencil=None), motion)
     if buffers.stencil is not None and source.stencil is not None:
         there = sample(source.stencil, x + motion[..., 0], y + motion[..., 1], filter="nearest")
         seen &= jnp.round(there) == jnp.round(buffers.stencil)
@@ -167,12 +158,18 @@ def seen_before_stage(space: Space | None = None) -> Stage:
             warped = jax.lax.cond(jnp.any(left & seen), fill, lambda warped: warped, warped)
             age += left.astype(age.dtype)  # once for each frame that is looked at in vain, and for the one that has it
             left = left & ~seen
+        memory = values["carry"]
+        if isinstance(memory, Memory):
+            divided = all(f.gbuffer.albedo is not None for f in (target, *values["sources"]))
+            found, seen = recall(target.gbuffer, memory, divided=divided, channels=warped.shape[-1])
+            warped = jnp.where(left & seen, found.astype(warped.dtype), warped)
+            left = left & ~seen
         return {"warped": warped, "image": warped[..., :3], "age": age + left.astype(age.dtype)}
 
     return Stage(
         "seen before",
         function,
-        takes=("history", "target", "sources", "layers", "holes", "warped"),
+        takes=("carry", "history", "target", "sources", "layers", "holes", "warped"),
         gives=("warped", "image", "age"),
         reads=("target.position", "history.position", guides_of("history")),
         optional=True,

@@ -19,6 +19,7 @@ from jaxtrapolate.methods.between import BETWEEN, PAIR
 from jaxtrapolate.methods.bidirectional import BLEND, GUIDED_FETCH, RELIGHT, REPROJECT_BOTH
 from jaxtrapolate.methods.frames import Frames, rendered
 from jaxtrapolate.methods.hindsight import HINDSIGHT, block_sums, from_blocks
+from jaxtrapolate.methods.memory import remember_stage, start
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.seen import Remembered, seen_before_stage
@@ -282,11 +283,12 @@ def shading_warp() -> Method:
     """The guided warp whose shadows and highlights move on as older frames show, and whose holes older frames fill.
 
     Ours. Light moves on where hindsight agrees; with two rendered frames the flow's own confidence decides, with one it
-    is the guided warp. The two older frames are looked at for what is hidden in the newest.
+    is the guided warp. What is hidden in the newest is looked for in the two older frames, then in what is remembered
+    of all before: the method has memory (`step`), without which it knows these two alone.
     """
     first = (reproject_stage(3), HOLES, HINDSIGHT, demodulate_stage(), guided_stage())
-    stages = (*first, *light_stages(), seen_before_stage(), modulate_stage(), SKY)
-    return Method("shading_warp", stages, past=3, settings=ShadingSettings())
+    stages = (remember_stage(), *first, *light_stages(), seen_before_stage(), modulate_stage(), SKY)
+    return Method("shading_warp", stages, past=3, settings=ShadingSettings(), start=start)
 
 
 def _towards(state, values: Values):
@@ -321,7 +323,8 @@ BOTH_TOWARDS = Stage(
 def bidirectional_shading() -> Method:
     """As "bidirectional_guided", the light of both frames carried to the target's time by its own motion.
 
-    Ours. Where the light's motion does not explain what changed between the frames, it is that method.
+    Ours. Where the light's motion does not explain what changed between the frames, it is that method. It has no memory
+    of frames before: on four training seeds that was worth 0.01 dB here, for half as much time again.
     """
     stages = (PAIR, BETWEEN, REPROJECT_BOTH, GUIDED_FETCH, BOTH_TOWARDS, BLEND, RELIGHT, SKY)
     return Method("bidirectional_shading", stages, kind="interpolation", future=1, settings=BetweenSettings())

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrapolate.checks import check_present
-from jaxtrapolate.methods.frames import Frames
+from jaxtrapolate.methods.frames import Frames, newest_color
 from jaxtrapolate.methods.stage import Stage, Values
 from jaxtrapolate.ops.jitter import jitter_difference
 from jaxtrapolate.ops.upsample import upsample, upsampled_size
@@ -39,10 +39,7 @@ def starter(scale: int) -> Callable[[Frames, Frame], Kept]:
     """`Method.start`: nothing has been answered yet."""
 
     def start(history: Frames, target: Frame) -> Kept:
-        colors = [frame.color for frame in (*history, target) if frame.color is not None]
-        if not colors:
-            raise ValueError(f"history: expected a frame with colour, got {len(history)} frames without")
-        color = colors[-1]
+        color = newest_color(history, target)
         height, width = upsampled_size((color.shape[0], color.shape[1]), scale)
         wide = widest(color)
         return Kept(jnp.zeros((height, width, 3), wide), jnp.zeros((), wide))

@@ -110,13 +110,22 @@ def project(matrix: Float[Array, "3 4"], position: Float[Array, "h w 3"]) -> Flo
     """
     check_array("matrix", matrix, shape=(3, 4))
     check_image("position", position, channels=3)
+    place, along = placed(matrix, position)
+    return jnp.where(along > 0, place, jnp.nan)
+
+
+def placed(matrix: Float[Array, "3 4"], position: Float[Array, "*n 3"]) -> tuple[Float[Array, "*n 2"], Array]:
+    """The pixels at which points are seen, and how far ahead they are `[*N, 1]`: their depth but for a factor.
+
+    Both 0 behind the camera, and where a position is not finite.
+    """
     finite = jnp.all(jnp.isfinite(position), -1, keepdims=True)
     held = jnp.where(finite, position, 0)
     # not a matrix product, which some GPUs take in fewer bits
-    rows = matrix.astype(held.dtype)[None, None]
+    rows = matrix.astype(held.dtype).reshape((1,) * (held.ndim - 1) + (3, 4))
     seen = jnp.sum(held[..., None, :] * rows[..., :3], -1) + rows[..., 3]
-    along = seen[..., 2:]
-    return jnp.where(finite & (along > 0), divide(seen[..., :2], along), jnp.nan)
+    along = jnp.where(finite & (seen[..., 2:] > 0), seen[..., 2:], 0)
+    return divide(seen[..., :2], along, where=along > 0), along
 
 
 __all__ = ["fitted_projection", "project"]

@@ -27,6 +27,25 @@ def _order(depth: Array) -> Array:
     return jax.lax.bitcast_convert_type(depth, jnp.uint32)
 
 
+def nearest_keys(cell: Int[Array, " n"], depth: Float[Array, " n"], count: int) -> Array:
+    """Of the points that land in each of some cells the nearest, as a key `[count]`; what lands in `count` is lost.
+
+    The keys of `sources_of`; the smaller of two keys is of the nearer point, of equal depths of the one that is first.
+    """
+    with jax.enable_x64(True):  # one 64-bit key orders by depth, then by source index
+        source = jnp.arange(depth.shape[0], dtype=jnp.uint64)
+        key = (_order(depth).astype(jnp.uint64) << jnp.uint64(32)) | source
+        return jnp.full(count + 1, _NONE, jnp.uint64).at[cell].min(key, mode="promise_in_bounds")[:-1]
+
+
+def sources_of(keys: Array) -> tuple[Int[Array, "*shape"], Bool[Array, "*shape"]]:
+    """Which point a key is of, and whether it is of any; 0 where it is of none."""
+    with jax.enable_x64(True):
+        covered = keys != _NONE
+        index = jnp.where(covered, keys & jnp.uint64(0xFFFFFFFF), jnp.uint64(0)).astype(jnp.int32)
+    return index, covered
+
+
 @partial(jax.jit, static_argnames=("footprint",))
 def splat_source(
     motion: Float[Array, "h w 2"], depth: Float[Array, "h w 1"], *, footprint: Literal[1, 4] = 4
@@ -48,16 +67,12 @@ def splat_source(
     count = rows * columns
     cell = row.astype(jnp.int32) * columns + column.astype(jnp.int32)
     cell = jnp.where(used, cell, count)
-    with jax.enable_x64(True):  # one 64-bit key orders by depth, then by source index
-        source = jnp.arange(height * width, dtype=jnp.uint64)
-        key = (_order(depth).reshape(-1).astype(jnp.uint64) << jnp.uint64(32)) | source
-        cells = jnp.full(count + 1, _NONE, jnp.uint64).at[cell.reshape(-1)].min(key, mode="promise_in_bounds")
-        cells = cells[:-1].reshape(rows, columns)
+    cells = nearest_keys(cell.reshape(-1), depth.reshape(-1), count).reshape(rows, columns)
+    with jax.enable_x64(True):
         if grow:
             cells = jnp.minimum(cells[:, :-1], cells[:, 1:])
             cells = jnp.minimum(cells[:-1], cells[1:])
-        covered = cells != _NONE
-        index = jnp.where(covered, cells & jnp.uint64(0xFFFFFFFF), jnp.uint64(0)).astype(jnp.int32)
+    index, covered = sources_of(cells)
     return index, covered
 
 
