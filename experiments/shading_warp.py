@@ -27,7 +27,8 @@ VARIANTS: dict[str, Callable[[Method], Method]] = {
     "shading_warp": lambda method: method,
     "light stays": lambda method: method.without("moved light", "shading flow", "light before"),
     "no hindsight": lambda method: method.without("light in hindsight"),
-    "no older frames": lambda method: method.without("seen before"),
+    "no memory": lambda method: method.without("remember"),
+    "no older frames, no memory": lambda method: method.without("seen before"),
     "older light as it was": lambda method: method.replace(relight=1.0),
     "agreement 0.4": lambda method: method.replace(agreement=0.4),
     "agreement 0.6": lambda method: method.replace(agreement=0.6),
@@ -38,7 +39,7 @@ VARIANTS: dict[str, Callable[[Method], Method]] = {
 
 def scores(sequence: SceneSequence, methods: dict[str, Method]) -> dict[str, list[dict[str, float]]]:
     """dB of each frame by method: whole, and by cause where there is any."""
-    found = jx.evaluate(sequence, methods, metrics=()).methods
+    found = jx.evaluate(sequence, methods, metrics=(), stages=False).methods
     return {
         name: [
             {"whole": frame.psnr}
@@ -61,7 +62,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--variants", default=",".join(VARIANTS))
-    parser.add_argument("--frames", type=int, default=12)
+    parser.add_argument("--frames", type=int, default=24)
     options = parser.parse_args()
     whole = jx.load("shading_warp")
     methods = {"guided_warp": jx.load("guided_warp")}

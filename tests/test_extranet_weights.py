@@ -52,9 +52,15 @@ def test_default_weights_are_of_the_public_layout():
     assert len(weights.load_weights(path).note) > 20
 
 
-def test_the_papers_network_has_no_default_weights_and_is_no_default():
-    with pytest.raises(ValueError, match=r"^method 'extranet': no default weights come with this version; [^\n]*$"):
-        jx.load("extranet")
+def test_the_papers_network_has_weights_and_is_no_default():
+    path = weights.default_weights("extranet")
+    assert path.stat().st_size <= weights.files.LARGEST_SHIPPED
+    stated = weights.load_weights(path)
+    assert len(stated.note) > 20
+    assert stated.config["preparation"]["first_guess"] == "warp"
+    assert stated.config["network"]["norm"]
+    with pytest.raises(ValueError, match=r"^method 'extrass': no default weights come with this version; [^\n]*$"):
+        jx.load("extrass")
     assert "extranet" in jx.method_names()
     assert {"guided_net", "guided_warp", "interpolator"} <= set(default_methods())
     assert set(jx.method_names()) - set(default_methods()) == set(ON_REQUEST)

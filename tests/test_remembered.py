@@ -181,6 +181,23 @@ def test_a_cut_and_a_change_of_light():
 
 
 @pytest.mark.slow
+def test_light_that_was_changing_is_not_remembered():
+    """The box drives behind its own shadow: what it hides was lit until that came, and dark when it was seen last."""
+
+    def shadowed(time):
+        frame = seen_frame(time, still=True)
+        shadow = np.roll(box(time), 14, 1) & ~box(time)
+        return replace(frame, color=jnp.where(shadow[..., None], 0.2 * frame.color, frame.color))
+
+    usual, dark = (
+        np.asarray(play([make(t) for t in range(-9, 0)])[0].layer.points.known).sum()
+        for make in (functools.partial(seen_frame, still=True), shadowed)
+    )
+    assert usual > 200
+    assert dark < 0.1 * usual
+
+
+@pytest.mark.slow
 def test_frames_that_say_nothing_are_forgotten():
     """Positions that are not finite, or absent, in one of the frames; the carry stays one pytree."""
     frames = [seen_frame(t) for t in range(-6, 0)]

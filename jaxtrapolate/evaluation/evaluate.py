@@ -45,6 +45,7 @@ def evaluate(
     factor: int = 2,
     metrics: Iterable[str] = DEFAULT_METRICS,
     frames: Iterable[int] | None = None,
+    stages: bool = True,
     step: Step = _silent,
 ) -> Results:
     """Holds frames back, generates them with each method from the others, and compares.
@@ -57,6 +58,7 @@ def evaluate(
             frames in a row are generated, each from rendered ones.
         metrics: names, as `jaxtrapolate.metrics.load` takes them; PSNR is always scored.
         frames: score only these held-back frames, and no rendered ones.
+        stages: whether each stage of a method is timed on its own, too, which compiles it once more.
         step: told how far the work is.
 
     Returns:
@@ -84,7 +86,7 @@ def evaluate(
                 unavailable[name] = str(error)
     named = {name: load_metric(name) for name in metrics}
     chosen: dict[str, Any] = {"factor": factor, "frames": frames, "unavailable": unavailable}
-    return Evaluation.prepare(opened, found, named, **chosen).run(step=step)
+    return Evaluation.prepare(opened, found, named, **chosen).run(stages=stages, step=step)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -390,6 +390,7 @@ class Method:
         """The carry before the first step; `()` for methods without memory."""
         if self.start is None:
             return ()
+        self._check(history, target, ())
         values = self.first_values((), history, target)
         return self.start(values["history"], values["target"])
 
