@@ -35,11 +35,12 @@ def evaluated(name: str) -> str:
     return table(["method", *columns], rows)
 
 
-PAST = ("repeat", "warp", "reproject", "warp_3d", "grid_extrapolate", "occlusion_warp", "guided_warp", "guided_net")
+PAST = ("repeat", "warp", "reproject", "warp_3d", "grid_extrapolate", "extranet", "occlusion_warp", "guided_warp")
+PAST += ("shading_warp", "guided_net")
 """Methods that use the past alone, in the order of their tables."""
 
 BOTH = ("blend", "half_motion", "grid_warp", "dis", "softmax_splat", "interpolator")
-BOTH += ("bidirectional_image", "bidirectional", "bidirectional_guided")
+BOTH += ("bidirectional_image", "bidirectional", "bidirectional_guided", "bidirectional_shading")
 """Methods that know the next rendered frame."""
 
 
@@ -52,9 +53,17 @@ def _best(columns: Sequence[Sequence[float]], digits: int = 2) -> list[list[str]
     ]
 
 
-def by_scene(names: Sequence[str], run: str = "test_seeds") -> str:
+def _test_seeds() -> dict[str, Any]:
+    """What was found on the test seeds: of methods that have changed since the first run, what the second says."""
+    first, second = (read(f"experiments/results/evaluated/{run}.json") for run in ("test_seeds", "test_seeds_light"))
+    later = {entry["input"]: entry["methods"] for entry in second["inputs"]}
+    inputs = [e | {"methods": e["methods"] | later[e["input"]]} for e in first["inputs"]]
+    return {"methods": first["methods"] | second["methods"], "inputs": inputs}
+
+
+def by_scene(names: Sequence[str]) -> str:
     """dB of methods on the test seeds, the mean over each scene's and over all."""
-    found = read(f"experiments/results/evaluated/{run}.json")
+    found = _test_seeds()
     inputs: dict[str, list[dict[str, Any]]] = {}
     for entry in found["inputs"]:
         if any(methods["psnr"] == "inf" for methods in entry["methods"].values()):
@@ -66,9 +75,9 @@ def by_scene(names: Sequence[str], run: str = "test_seeds") -> str:
     return table(["dB", *inputs, "mean"], [list(row) for row in rows])
 
 
-def by_cause(names: Sequence[str], run: str = "test_seeds") -> str:
+def by_cause(names: Sequence[str]) -> str:
     """dB of methods on the test seeds by cause."""
-    found = read(f"experiments/results/evaluated/{run}.json")["methods"]
+    found = _test_seeds()["methods"]
     causes = {cause: entry["share"] for cause, entry in found[names[0]]["by_cause"].items()}
     columns = [[found[name]["by_cause"][cause]["psnr"] for name in names] for cause in causes]
     head = [f"{cause} {100 * share:.1f} %" for cause, share in causes.items()]
@@ -80,7 +89,7 @@ _RENAMED = {"extranet": "guided_net"}
 _MEASURED = {"czest1dm": "path-traced map", "torcs": "cars", "bunker": "engine clip"}
 
 
-LIGHT = ("guided_warp", "shading_warp", "bidirectional_guided", "bidirectional_shading")
+LIGHT = ("guided_warp", "shading_warp", "guided_net", "bidirectional_guided", "bidirectional_shading")
 """Methods without and with the light's own motion."""
 
 
@@ -98,8 +107,12 @@ def before() -> str:
     found = {}
     columns = {"test_seeds": "embedded scenes"} | {f"{name}_both": title for name, title in _MEASURED.items()}
     for name in columns:
-        pair = (read(f"experiments/results/evaluated/{folder}{name}.json")["methods"] for folder in ("before/", ""))
-        found[name] = [{_RENAMED.get(key, key): m["psnr"] for key, m in methods.items()} for methods in pair]
+        old, new = (read(f"experiments/results/evaluated/{folder}{name}.json")["methods"] for folder in ("before/", ""))
+        since = _test_seeds()["methods"] if name == "test_seeds" else new
+        found[name] = [
+            {_RENAMED.get(key, key): method["psnr"] for key, method in old.items()},
+            {key: method["psnr"] for key, method in since.items()},
+        ]
     rows = []
     for name in (*PAST, *BOTH):
         cells = [f"{old[name]:.2f} -> {new[name]:.2f}" if name in old else "" for old, new in found.values()]
@@ -118,8 +131,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "test-causes": partial(by_cause, PAST),
     "test-causes-both": partial(by_cause, BOTH),
     "both-sides": both_sides,
-    "light": partial(by_scene, LIGHT, "test_seeds_light"),
-    "light-causes": partial(by_cause, LIGHT, "test_seeds_light"),
+    "light": partial(by_scene, LIGHT),
+    "light-causes": partial(by_cause, LIGHT),
     "before": before,
 }
 """Each by its name in the pages."""

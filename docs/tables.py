@@ -253,6 +253,18 @@ def curve() -> str:
     return table(["step", *map(str, steps)], rows)
 
 
+def extranet_curve() -> str:
+    """The validation gain of the paper's network over its first guess, the plain warp."""
+    lines = read("experiments/results/extranet_training.jsonl")
+    found = {line["step"]: line for line in lines if line["kind"] == "validation"}
+    steps = range(1000, max(found) + 1, 2000)
+    gains = {
+        "whole": [found[step]["gain"] for step in steps],
+        "holes": [found[step]["psnr_hole"] - found[step]["guess_hole"] for step in steps],
+    }
+    return table(["step", *map(str, steps)], [[part, *(f"{v:.2f}" for v in values)] for part, values in gains.items()])
+
+
 def noted(name: str) -> str:
     """Rows that were noted as they were seen."""
     found = read(f"experiments/results/{name}.json")
@@ -380,6 +392,7 @@ TABLES: dict[str, Callable[[], str]] = scores.TABLES | {
     "ablations": ablations,
     "failures": failures,
     "curve": curve,
+    "extranet-curve": extranet_curve,
     "rounds": partial(noted, "rounds"),
     "recipes": partial(noted, "recipes"),
     "sizes": sizes,

@@ -8,7 +8,7 @@ import numpy as np
 import oracles
 import pytest
 from flax import nnx
-from marks import slow
+from marks import slow_rows
 from oracles import random
 from small_extranet import image_of, make_window, random_model
 
@@ -128,16 +128,28 @@ def test_what_the_network_is_shown_against_the_oracle():
     np.testing.assert_array_equal(values["inputs"][2], small.roughness)
 
 
-@pytest.mark.parametrize("modulated", [True, *slow(False)])
-def test_the_answer_is_the_flows_light_where_the_mask_takes_it(modulated):
-    preparation = Refinement(space="linear", modulated=modulated)
+ROWS = [(True, "light"), (False, "change"), *slow_rows((False, "light"), (True, "change"))]
+
+
+@pytest.mark.parametrize(("modulated", "taken"), ROWS)
+def test_the_answer_is_the_flows_light_where_the_mask_takes_it(modulated, taken):
+    preparation = Refinement(space="linear", modulated=modulated, taken=taken)
     method = extrass_refine(silent((1.0, 0.0)), preparation=preparation)
     history, target = make_window(SIZE, rendered=2)
     values = method.values_before("network", method.state, (), history, target)
     newer = np.asarray(values["inputs"][0], np.float64)
     moved = oracles.backward_warp(newer, np.broadcast_to([1.0, 0.0], (*newer.shape[:2], 2)))
-    light = moved**2 / (1 - moved**2)
-    light = np.repeat(np.repeat(light, 2, 0), 2, 1)[: SIZE[0], : SIZE[1]]
+
+    def larger(image):
+        return np.repeat(np.repeat(image, 2, 0), 2, 1)[: SIZE[0], : SIZE[1]]
+
+    light = larger(moved)
+    if taken == "change":
+        before = np.maximum(np.float64(values["image" if modulated else "warped"]), 0)
+        before = np.sqrt(before / (1 + before))
+        most = np.maximum(np.maximum(before, larger(newer)), light)
+        light = np.clip(before + light - larger(newer), 0, most)
+    light = light**2 / (1 - light**2)
     buffers = jax.tree.map(np.asarray, target.gbuffer)
     if not modulated:
         light = light * np.where(buffers.sky > 0.5, 1, np.maximum(buffers.albedo, 0.01))

@@ -43,6 +43,7 @@ from jaxtrapolate.weights import configured
 WARP_NAME, REFINE_NAME = "extrass_warp", "extrass_refine"
 
 Curve = Literal["tone", "log"]
+Taken = Literal["light", "change"]
 
 
 @settings
@@ -80,6 +81,8 @@ class Refinement:
             full size makes a colour again.
         curve: in which values it sees them: "tone", `compress`, or "log", `log_encode`.
         space: in which colours are fetched between pixels.
+        taken: what of FRNet's answer is taken: "light", itself, as in the paper, or "change", what it has changed of
+            its newer input, which is added to the guided warp at full size, whose detail stays.
     """
 
     by: By = "albedo"
@@ -88,9 +91,10 @@ class Refinement:
     modulated: bool = True
     curve: Curve = "tone"
     space: Space = "tone"
+    taken: Taken = "light"
 
     def __post_init__(self) -> None:
-        for name, choices in (("by", By), ("curve", Curve), ("space", Space)):
+        for name, choices in (("by", By), ("curve", Curve), ("space", Space), ("taken", Taken)):
             check_choice(name, getattr(self, name), get_args(choices))
         if not 0 <= self.floor < float("inf"):
             raise ValueError(f"floor: expected 0 or more, got {self.floor!r}")
@@ -253,9 +257,15 @@ def refinement_stages(
 
     def blend(state, values: Values):
         target, warped = values["target"].gbuffer, values["image"]
-        light = doubled(preparation.decode(values["refined"]), warped)
-        sources = values["sources"]
-        if not preparation.modulated and _have_albedo(target, *(source.gbuffer for source in sources)):
+        divided = not preparation.modulated and _have_albedo(target, *(s.gbuffer for s in values["sources"]))
+        if preparation.taken == "change":
+            own = preparation.encode(values["warped"] if divided else warped)
+            before, after = (doubled(a, own) for a in (values["inputs"][0], values["refined"]))
+            most = jnp.maximum(own, jnp.maximum(before, after))
+            light = preparation.decode(jnp.clip(own + (after - before), 0, most))
+        else:
+            light = doubled(preparation.decode(values["refined"]), warped)
+        if divided:
             buffers = reflecting(target, preparation.sky)
             light = modulate(light, buffers, by=preparation.by, floor=preparation.floor)
         mask = jnp.where(values["moves"], blend_mask(light, warped, target, state.settings), 0)
@@ -263,6 +273,7 @@ def refinement_stages(
         mixed = light * mask + warped.astype(light.dtype) * (1 - mask)
         return {"image": jnp.where(mask > 0, mixed, warped).astype(warped.dtype)}
 
+    blended = ("image", "warped", "inputs", "refined", "moves", "sources", "target")
     still = Needed(
         "light moves",
         lambda state, values: jnp.any(values["inputs"][0] != values["inputs"][1]),
@@ -277,7 +288,7 @@ def refinement_stages(
         Stage("guided frame", lambda state, values: {"guided": values["image"]}, ("image",), ("guided",)),
         _halve_stage(preparation),
         Stage("network", network, ("inputs",), ("refined", "moves"), optional=True, past=2, needed=still),
-        Stage("blend", blend, ("image", "refined", "moves", "sources", "target"), ("image",), optional=True, past=2),
+        Stage("blend", blend, blended, ("image",), optional=True, past=2),
     )
 
 
