@@ -5,7 +5,7 @@ from functools import partial
 from statistics import fmean
 from typing import Any
 
-from tabulate import milliseconds, read, table
+from tabulate import ROOT, milliseconds, read, table
 
 
 def evaluated(name: str) -> str:
@@ -53,22 +53,27 @@ def _best(columns: Sequence[Sequence[float]], digits: int = 2) -> list[list[str]
     ]
 
 
-def _test_seeds() -> dict[str, Any]:
-    """What was found on the test seeds: of methods that have changed since the first run, what the second says."""
-    first, second = (read(f"experiments/results/evaluated/{run}.json") for run in ("test_seeds", "test_seeds_light"))
-    later = {entry["input"]: entry["methods"] for entry in second["inputs"]}
-    inputs = [e | {"methods": e["methods"] | later[e["input"]]} for e in first["inputs"]]
-    return {"methods": first["methods"] | second["methods"], "inputs": inputs}
+def _found(name: str) -> dict[str, Any]:
+    """What was found on an input in several runs: of methods that have changed since a run, what the next says."""
+    methods: dict[str, Any] = {}
+    inputs: dict[str, dict[str, Any]] = {}
+    for run in (name, f"{name}_light", f"{name}_extranet"):
+        if not (ROOT / f"experiments/results/evaluated/{run}.json").exists():
+            continue
+        found = read(f"experiments/results/evaluated/{run}.json")
+        methods |= found["methods"]
+        for entry in found.get("inputs") or ():
+            inputs.setdefault(entry["input"], {}).update(entry["methods"])
+    return {"methods": methods, "inputs": inputs}
 
 
 def by_scene(names: Sequence[str]) -> str:
     """dB of methods on the test seeds, the mean over each scene's and over all."""
-    found = _test_seeds()
+    found = _found("test_seeds")
     inputs: dict[str, list[dict[str, Any]]] = {}
-    for entry in found["inputs"]:
-        if any(methods["psnr"] == "inf" for methods in entry["methods"].values()):
-            continue  # the scene in which nothing moves
-        inputs.setdefault(entry["input"].rpartition("-")[0], []).append(entry["methods"])
+    for name, methods in found["inputs"].items():
+        if not any(method["psnr"] == "inf" for method in methods.values()):  # not the scene in which nothing moves
+            inputs.setdefault(name.rpartition("-")[0], []).append(methods)
     columns = [[fmean(methods[name]["psnr"] for methods in group) for name in names] for group in inputs.values()]
     columns.append([found["methods"][name]["psnr"] for name in names])
     rows = zip(names, *_best(columns), strict=True)
@@ -77,7 +82,7 @@ def by_scene(names: Sequence[str]) -> str:
 
 def by_cause(names: Sequence[str]) -> str:
     """dB of methods on the test seeds by cause."""
-    found = _test_seeds()["methods"]
+    found = _found("test_seeds")["methods"]
     causes = {cause: entry["share"] for cause, entry in found[names[0]]["by_cause"].items()}
     columns = [[found[name]["by_cause"][cause]["psnr"] for name in names] for cause in causes]
     head = [f"{cause} {100 * share:.1f} %" for cause, share in causes.items()]
@@ -95,8 +100,8 @@ LIGHT = ("guided_warp", "shading_warp", "guided_net", "bidirectional_guided", "b
 
 def both_sides() -> str:
     """dB of methods that know the next frame too, on measured inputs."""
-    found = {name: read(f"experiments/results/evaluated/{name}_both.json")["methods"] for name in _MEASURED}
-    names = [*BOTH, "guided_warp", "guided_net"]
+    found = {name: _found(f"{name}_both")["methods"] for name in _MEASURED}
+    names = [*BOTH, "extranet", "guided_warp", "shading_warp", "guided_net"]
     columns = [[methods[name]["psnr"] for name in names] for methods in found.values()]
     titles = [f"{name} (from one side)" if name in PAST else name for name in names]
     return table(["dB", *_MEASURED.values()], [list(row) for row in zip(titles, *_best(columns), strict=True)])
@@ -107,8 +112,7 @@ def before() -> str:
     found = {}
     columns = {"test_seeds": "embedded scenes"} | {f"{name}_both": title for name, title in _MEASURED.items()}
     for name in columns:
-        old, new = (read(f"experiments/results/evaluated/{folder}{name}.json")["methods"] for folder in ("before/", ""))
-        since = _test_seeds()["methods"] if name == "test_seeds" else new
+        old, since = read(f"experiments/results/evaluated/before/{name}.json")["methods"], _found(name)["methods"]
         found[name] = [
             {_RENAMED.get(key, key): method["psnr"] for key, method in old.items()},
             {key: method["psnr"] for key, method in since.items()},

@@ -28,7 +28,7 @@ VARIANTS: dict[str, Callable[[Method], Method]] = {
     "light stays": lambda method: method.without("moved light", "shading flow", "light before"),
     "no hindsight": lambda method: method.without("light in hindsight"),
     "no memory": lambda method: method.without("remember"),
-    "no older frames, no memory": lambda method: method.without("seen before"),
+    "no older frames and no memory": lambda method: method.without("seen before"),
     "older light as it was": lambda method: method.replace(relight=1.0),
     "agreement 0.4": lambda method: method.replace(agreement=0.4),
     "agreement 0.6": lambda method: method.replace(agreement=0.6),
