@@ -198,6 +198,19 @@ def test_light_that_was_changing_is_not_remembered():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("light", [1e-30, 1e30])
+def test_light_beyond_all_measure_stays_finite(light):
+    """In one of the frames, and in those after it."""
+    frames = [seen_frame(t, still=True) for t in range(-9, 0)]
+    frames[4:6] = [replace(f, color=f.color * light) for f in frames[4:6]]
+    carry, _ = play(frames)
+    known = np.asarray(carry.layer.points.known)[..., 0]
+    assert np.isfinite(np.asarray(carry.layer.points.values)[known]).all()
+    image = method().step(carry, tuple(frames[-4:]), hide(seen_frame(0, still=True)))[1]
+    assert np.isfinite(np.asarray(image)).all()
+
+
+@pytest.mark.slow
 def test_frames_that_say_nothing_are_forgotten():
     """Positions that are not finite, or absent, in one of the frames; the carry stays one pytree."""
     frames = [seen_frame(t) for t in range(-6, 0)]

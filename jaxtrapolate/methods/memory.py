@@ -31,6 +31,8 @@ _ASKED = 4096  # points, of how all light has changed
 _ROUGH = 0.3  # less rough, light depends on where it is seen from
 _BLOCK = 8  # pixels, of a block
 _EVIDENCE = 4  # points around a block say how light has changed
+_STEP = 7.0  # of the logarithm: so much light changes from one frame to the next at most
+_BRIGHTEST = 1e9
 _DARKEST = 1e-3  # light under which a ratio says nothing
 _DIFFERS = 0.5  # of the logarithm: light that is so much other is another's
 
@@ -91,7 +93,7 @@ def _brighter(points: Landed) -> Array:
     ratios = jnp.where(usual, jnp.log(jnp.where(usual, divide(now, before), 1)), jnp.inf)
     middle = jnp.sum(usual, 0, keepdims=True) // 2
     median = jnp.take_along_axis(jnp.sort(ratios, 0), middle.astype(jnp.int32), 0)[0]
-    return jnp.where(jnp.isfinite(median), jnp.exp(median), 1)
+    return jnp.where(jnp.isfinite(median), jnp.exp(jnp.clip(median, -_STEP, _STEP)), 1)
 
 
 def _off(points: Landed, usual: Array) -> Array:
@@ -156,7 +158,8 @@ def _remember(how: Any, state, values: Values):
     light, believed = _as_reappeared(again, (known.shape[0], known.shape[1]), usual)
     same_scene = found > _SCENE * landed
     points = layer.points
-    changed = jnp.concatenate([points.values[..., :3] * light, points.values[..., 3:]], -1)
+    light = jnp.clip(points.values[..., :3] * light, -_BRIGHTEST, _BRIGHTEST)
+    changed = jnp.concatenate([light, points.values[..., 3:]], -1)
     points = replace(points, values=changed, known=points.known & believed & same_scene)
     restless = _restless(still, memory.restless, usual) & same_scene
     return {"carry": Memory(HiddenLayer(points, matrix), restless), "image": values["image"]}
