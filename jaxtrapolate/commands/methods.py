@@ -63,6 +63,8 @@ def run(options: argparse.Namespace) -> None:
     if method is None:
         return
     out.print(f"{method.kind}; rendered frames before + after: {_frames(method)}; size of the output: {method.scale} x")
+    if method.memory:
+        out.print("it remembers: handed every frame in order of display, the rendered ones too (`init`, `step`)")
     if times and options.name in times.ms:
         out.print(f"{_ms(times, options.name)} ms: {times}", soft_wrap=True)
     if method.options:
