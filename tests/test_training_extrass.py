@@ -11,7 +11,10 @@ from small_extranet import make_window, random_model
 
 import jaxtrapolate as jx
 from jaxtrapolate.evaluation.windows import Window
+from jaxtrapolate.methods.extrass import Refinement
 from jaxtrapolate.networks import FRNet, FRNetConfig
+from jaxtrapolate.networks.blocks import pixel_shuffle
+from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.records import replace
 from jaxtrapolate.training import Config, Optimizer, load_config, train_and_evaluate
 from jaxtrapolate.training.config import parse_config
@@ -66,6 +69,30 @@ def test_the_loss_written_out(example):
     np.testing.assert_allclose(total, charbonnier + census + 0.001 * feature, rtol=1e-5)
 
 
+@pytest.mark.slow
+def test_the_blend_that_is_trained_is_the_frame_that_the_method_makes(example):
+    _, window, _ = example
+    preparation = Refinement(modulated=False, taken="change", changed=0.0)
+    options = dataclasses.replace(OPTIONS, preparation=preparation, loss="blend", crops="error", crop=(8, 8))
+    task, model = FRNetTask(options), random_model(SMALL, FRNet)
+    made = jax.jit(task._prepare)(window, jax.random.key(0))
+    batch = jax.tree.map(lambda a: a[None], made)
+    found = nnx.jit(FRNet.__call__)(model, batch["newer"], batch["older"], batch["roughness"])
+    blended, truth, guess = (np.float64(pixel_shuffle(a))[0, :25, :33] for a in task._blended(found.image, batch))
+    method = task._stages.with_weights(inference(model)[1])
+    image = np.maximum(np.float64(jax.jit(method.__call__)(window.history, window.target)), 0)
+    known = np.isfinite(truth)
+    assert np.mean(np.abs(blended - guess)) > 1e-3
+    np.testing.assert_allclose(blended[known], np.sqrt(image / (1 + image))[known], atol=1e-5)
+    light = np.float64(window.truth.color)
+    np.testing.assert_allclose(truth[known], np.sqrt(light / (1 + light))[known], rtol=1e-5)
+    np.testing.assert_array_equal(~known.any(-1), np.asarray(window.target.gbuffer.sky)[..., 0] > 0.5)
+    share = np.square(blended - truth)[known].sum() / (np.square(guess - truth)[known].sum() + 1e-6 * known.sum())
+    np.testing.assert_allclose(task.loss(model, batch)[0], share, rtol=1e-4)
+    cut = task.sample(made, jax.random.key(1))
+    assert cut["own"].shape == (8, 8, 12)
+
+
 def test_configuration_and_errors():
     config = load_config("extrass_refine")
     assert isinstance(config.options, FRNetOptions)
@@ -76,6 +103,9 @@ def test_configuration_and_errors():
         parse_config({"task": "extrass_refine", "steps": 1, "options": {"crop": [97, 20]}})
     with pytest.raises(ValueError, match=r"options\.feature_weight: expected at least 0"):
         parse_config({"task": "extrass_refine", "steps": 1, "options": {"feature_weight": -1.0}})
+    with pytest.raises(ValueError, match='crops: "error" is of the loss "blend"'):
+        parse_config({"task": "extrass_refine", "steps": 1, "options": {"crops": "error"}})
+    assert load_config("extrass_refine_blend").options.preparation.changed == 0
 
 
 @pytest.mark.slow

@@ -83,6 +83,7 @@ class Refinement:
         space: in which colours are fetched between pixels.
         taken: what of FRNet's answer is taken: "light", itself, as in the paper, or "change", what it has changed of
             its newer input, which is added to the guided warp at full size, whose detail stays.
+        changed: from which relative difference to the guided warp on it is taken; the option `changed` begins there.
     """
 
     by: By = "albedo"
@@ -92,19 +93,21 @@ class Refinement:
     curve: Curve = "tone"
     space: Space = "tone"
     taken: Taken = "light"
+    changed: float = 0.1
 
     def __post_init__(self) -> None:
         for name, choices in (("by", By), ("curve", Curve), ("space", Space), ("taken", Taken)):
             check_choice(name, getattr(self, name), get_args(choices))
-        if not 0 <= self.floor < float("inf"):
-            raise ValueError(f"floor: expected 0 or more, got {self.floor!r}")
+        for name, value in (("floor", self.floor), ("changed", self.changed)):
+            if not 0 <= value < float("inf"):
+                raise ValueError(f"{name}: expected 0 or more, got {value!r}")
 
-    def encode(self, image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
+    def encode(self, image: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Light as FRNet sees it, in at least float32; what is negative or NaN counts as 0."""
         image = image.astype(widest(image))
         return compress(image) if self.curve == "tone" else log_encode(jnp.where(jnp.isfinite(image), image, 0))
 
-    def decode(self, image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
+    def decode(self, image: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """The inverse of `encode`."""
         return expand(image) if self.curve == "tone" else log_decode(image)
 
@@ -142,6 +145,40 @@ def _step(x: Array, softness: Array) -> Array:
     return jnp.where(soft, jnp.clip((x / jnp.where(soft, softness, 1) + 1) / 2, 0, 1), jnp.where(x > 0, 1, 0))
 
 
+def taken(
+    preparation: Refinement, own: Float[Array, "*n"], before: Float[Array, "*n"], after: Float[Array, "*n"]
+) -> Float[Array, "*n"]:
+    """What FRNet's answer makes of the guided warp, all as `encode` has it.
+
+    Args:
+        preparation: whose `taken` says it.
+        own: the guided warp at full size.
+        before: the newer image that FRNet was shown, doubled.
+        after: its answer, doubled.
+    """
+    if preparation.taken == "light":
+        return after
+    return jnp.clip(own + (after - before), 0, jnp.maximum(own, jnp.maximum(before, after)))
+
+
+def alike(buffers: GBuffer | None, like: Float[Array, "h w c"]) -> Float[Array, "h w 1"]:
+    """How much each pixel's surface is that which stands for it at half size: eq. 6's first test, 1 where it is.
+
+    Args:
+        buffers: of the target; albedo and normal that are absent count as alike.
+        like: an image of the result's dtype.
+    """
+    buffers, found = buffers or GBuffer(), jnp.ones_like(like[..., :1])
+    if buffers.albedo is not None:
+        albedo = jnp.asarray(buffers.albedo, like.dtype)
+        apart = jnp.sum(jnp.square(doubled(half(albedo), albedo) - albedo), -1, keepdims=True)
+        found -= jnp.sqrt(apart / 3)
+    if buffers.normal is not None:
+        normal = jnp.asarray(buffers.normal, like.dtype)
+        found *= jnp.sum(doubled(half(normal), normal) * normal, -1, keepdims=True)
+    return found
+
+
 def blend_mask(
     light: Float[Array, "h w 3"], warped: Float[Array, "h w 3"], buffers: GBuffer | None, how: Any
 ) -> Float[Array, "h w 1"]:
@@ -153,7 +190,7 @@ def blend_mask(
     Args:
         light: `[H, W, 3]`, refined at half size and doubled.
         warped: `[H, W, 3]`, by the guided warp at full size.
-        buffers: of the target; albedo and normal that are absent count as alike.
+        buffers: of the target, see `alike`.
         how: a `Blend`.
 
     References:
@@ -166,17 +203,9 @@ def blend_mask(
     )
     known = jnp.all(jnp.isfinite(light) & jnp.isfinite(warped), -1, keepdims=True)
     light, warped = (jnp.where(known, a, 0).astype(light.dtype) for a in (light, warped))
-    alike = jnp.ones_like(light[..., :1])
-    if buffers.albedo is not None:
-        albedo = jnp.asarray(buffers.albedo, light.dtype)
-        apart = jnp.sum(jnp.square(doubled(half(albedo), albedo) - albedo), -1, keepdims=True)
-        alike -= jnp.sqrt(apart / 3)
-    if buffers.normal is not None:
-        normal = jnp.asarray(buffers.normal, light.dtype)
-        alike *= jnp.sum(doubled(half(normal), normal) * normal, -1, keepdims=True)
     size = jnp.maximum(jnp.sum(jnp.abs(light), -1, keepdims=True), least)
     difference = divide(jnp.sum(jnp.abs(light - warped), -1, keepdims=True), size)
-    mask = _step(alike - similar, softness) * _step(difference - changed, softness)
+    mask = _step(alike(buffers, light) - similar, softness) * _step(difference - changed, softness)
     if buffers.sky is not None:
         known &= buffers.sky < 0.5
     return jnp.where(known, mask, 0)
@@ -187,7 +216,7 @@ def _halve_stage(preparation: Refinement) -> Stage:
 
     def function(state, values: Values):
         target, warped, sources = halved(values["target"].gbuffer), [], values["sources"]
-        divided = _have_albedo(target, *(source.gbuffer for source in sources))
+        divided = have_albedo(target, *(source.gbuffer for source in sources))
         for source, motion in zip(sources, values["motions"], strict=True):
             buffers, color = halved(source.gbuffer), half(jnp.asarray(source.color))
             shorter = half(motion) / 2
@@ -230,8 +259,8 @@ def extrass_refine(model: FRNet, *, preparation: Refinement = Refinement()) -> M
     """
     function, weights = inference(model)
     stages = (*refinement_stages(function, model.config, preparation, weights_of=lambda all: all), SKY)
-    networks = {"network": function}
-    return Method(REFINE_NAME, stages, past=2, weights=weights, settings=Blend(), networks=networks)
+    given: dict[str, Any] = {"settings": Blend(changed=preparation.changed), "networks": {"network": function}}
+    return Method(REFINE_NAME, stages, past=2, weights=weights, **given)
 
 
 def refinement_stages(
@@ -257,14 +286,10 @@ def refinement_stages(
 
     def blend(state, values: Values):
         target, warped = values["target"].gbuffer, values["image"]
-        divided = not preparation.modulated and _have_albedo(target, *(s.gbuffer for s in values["sources"]))
-        if preparation.taken == "change":
-            own = preparation.encode(values["warped"] if divided else warped)
-            before, after = (doubled(a, own) for a in (values["inputs"][0], values["refined"]))
-            most = jnp.maximum(own, jnp.maximum(before, after))
-            light = preparation.decode(jnp.clip(own + (after - before), 0, most))
-        else:
-            light = doubled(preparation.decode(values["refined"]), warped)
+        divided = not preparation.modulated and have_albedo(target, *(s.gbuffer for s in values["sources"]))
+        own = preparation.encode(values["warped"] if divided else warped)
+        before, after = (doubled(a, own) for a in (values["inputs"][0], values["refined"]))
+        light = preparation.decode(taken(preparation, own, before, after))
         if divided:
             buffers = reflecting(target, preparation.sky)
             light = modulate(light, buffers, by=preparation.by, floor=preparation.floor)
@@ -292,7 +317,8 @@ def refinement_stages(
     )
 
 
-def _have_albedo(*buffers: GBuffer | None) -> bool:
+def have_albedo(*buffers: GBuffer | None) -> bool:
+    """Whether all have it, so that light is divided by it."""
     return all(b is not None and b.albedo is not None for b in buffers)
 
 
@@ -309,7 +335,7 @@ def encoded_truth(
     Raises:
         TypeError, ValueError: no floating-point array, or a size that differs.
     """
-    if not preparation.modulated and _have_albedo(buffers):
+    if not preparation.modulated and have_albedo(buffers):
         given = reflecting(buffers, preparation.sky)
         color = demodulate(color, given, by=preparation.by, floor=preparation.floor)
     return preparation.encode(half(color))

@@ -94,7 +94,7 @@ def extrass(model: ExtraSS, *, preparation: Refinement = PREPARATION) -> Method:
         past=2,
         scale=scale,
         weights={"frnet": refining, "sampler": sampling},
-        settings=JointSettings(),
+        settings=JointSettings(changed=preparation.changed),
         networks={"frnet": refine, "sampler": sample},
         start=starter(scale),
     )
