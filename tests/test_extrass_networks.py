@@ -15,6 +15,7 @@ from jaxtrapolate.networks.blocks import pixel_shuffle, pixel_unshuffle
 from jaxtrapolate.ops.upsample import upsample
 
 FLOW, MERGED = FRNetConfig(widths=(4, 6)), FRNetConfig(widths=(4, 6), merge=True, roughness=False)
+LED = FRNetConfig(widths=(4, 6), led=True)
 SAMPLER = ExtraSSNetConfig(widths=(4, 6), bottleneck=8)
 
 
@@ -50,7 +51,7 @@ def frames(height, width):
 
 @pytest.fixture(scope="module")
 def models():
-    return {config: random_model(config, FRNet) for config in (FLOW, MERGED)}
+    return {config: random_model(config, FRNet) for config in (FLOW, MERGED, LED)}
 
 
 @pytest.mark.parametrize("level", [0, 1])
@@ -64,6 +65,24 @@ def test_the_flow_warps_the_newer_frame_alone(models, level):
     np.testing.assert_allclose(found.flow, np.broadcast_to(flow, (8, 12, 2)), atol=1e-6)
     expected = oracles.backward_warp(np.asarray(newer), np.broadcast_to(flow, (8, 12, 2)))
     np.testing.assert_allclose(found.image, expected, atol=1e-5)
+
+
+def test_led_by_a_flow(models):
+    """What it begins with is the flow as far as it is trusted; what it says by itself is added."""
+    model, flow = silent(models[LED]), np.array([1.25, -0.5])
+    function, state = inference(model)
+    newer, older, roughness = frames(7, 11)
+    rng = np.random.default_rng(3)
+    lead = np.concatenate([rng.uniform(-3, 3, (7, 11, 2)), rng.uniform(size=(7, 11, 1))], -1).astype(np.float32)
+    trusted = lead[..., :2] * lead[..., 2:]
+    found = function(state, newer, older, roughness, lead)
+    np.testing.assert_allclose(found.flow, trusted, atol=1e-6)
+    np.testing.assert_allclose(found.image, oracles.backward_warp(np.asarray(newer), trusted), atol=1e-5)
+    predict(model.decoders[1], flow)
+    function, state = inference(model)
+    np.testing.assert_allclose(function(state, newer, older, roughness, lead).flow, trusted + flow, atol=1e-6)
+    with pytest.raises(ValueError, match="lead"):
+        function(state, newer, older, roughness)
 
 
 def test_merged_by_hand(models):

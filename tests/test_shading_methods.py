@@ -6,10 +6,13 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import nnx
 from marks import slow
 
 import jaxtrapolate as jx
+from jaxtrapolate.methods.extrass import Refinement, extrass_refine
 from jaxtrapolate.methods.shading import steps_on
+from jaxtrapolate.networks import FRNet, FRNetConfig
 from jaxtrapolate.records import Frame, GBuffer, replace
 
 SIZE = (66, 100)
@@ -74,6 +77,18 @@ def test_shadow_goes_on(past):
     before, after = (db(method(name)(history, target), truth) for name in ("guided_warp", "shading_warp"))
     assert after > before + 8
     assert after > 38
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("past", [3, 2])
+def test_shadow_goes_on_in_a_network_that_is_led(past):
+    """FRNet, untrained, begins with the motion of light; without two rendered frames it is the guided warp."""
+    model = FRNet(FRNetConfig(widths=(4, 6), led=True), rngs=nnx.Rngs(0))
+    led = extrass_refine(model, preparation=Refinement(modulated=False, taken="change", changed=0.0))
+    history, target, truth = window(past)
+    plain = method("extrass_warp")(history, target)
+    assert db(led(history, target), truth) > db(plain, truth) + 6
+    assert np.array_equal(led(history[-1:], target), plain)
 
 
 def test_shadow_goes_on_where_it_was_hidden():

@@ -29,7 +29,7 @@ OPTIONS = FRNetOptions(network=SMALL, windows=WindowOptions(size=(36, 44)), crop
 @pytest.fixture(scope="module")
 def example():
     """A task, a random window of an odd size, and what the task makes of it."""
-    history, target = make_window((25, 33), rendered=2)
+    history, target = make_window((25, 33), rendered=3)
     color = jnp.asarray(np.random.default_rng(9).uniform(0, 3, (25, 33, 3)), jnp.float32)
     window = Window(0, replace(target, color=color), history, target, ())
     task = FRNetTask(OPTIONS)

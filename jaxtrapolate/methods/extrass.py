@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.checks import check_choice
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
+from jaxtrapolate.methods.shading import Continued, light_stages
 from jaxtrapolate.methods.space import Space, space
 from jaxtrapolate.methods.stage import Needed, Stage, Values
 from jaxtrapolate.methods.stages import (
@@ -122,6 +123,11 @@ class Blend(Guide):
     least: float = option(0.001, "brightness below which differences are no longer relative", low=1e-30)
 
 
+@settings
+class LedBlend(Blend, Continued):
+    """And of the flow of light that FRNet begins with."""
+
+
 def half(image: Float[Array, "h w c"]) -> Float[Array, "i j c"]:
     """Every other pixel of every other row: `[ceil(H / 2), ceil(W / 2), C]`."""
     return image[::2, ::2]
@@ -211,13 +217,16 @@ def blend_mask(
     return jnp.where(known, mask, 0)
 
 
-def _halve_stage(preparation: Refinement) -> Stage:
-    """Both histories halved and guided-warped there, each by its own motion and buffers, and the halved roughness."""
+def _halve_stage(preparation: Refinement, *, led: bool) -> Stage:
+    """Both histories halved and guided-warped there, each by its own motion and buffers, and the halved roughness.
+
+    led: whether the flow of light and the trust in it follow, halved too; where they are not known both are 0.
+    """
 
     def function(state, values: Values):
         target, warped, sources = halved(values["target"].gbuffer), [], values["sources"]
         divided = have_albedo(target, *(source.gbuffer for source in sources))
-        for source, motion in zip(sources, values["motions"], strict=True):
+        for source, motion in zip(sources[:2], values["motions"][:2], strict=True):
             buffers, color = halved(source.gbuffer), half(jnp.asarray(source.color))
             shorter = half(motion) / 2
             how: dict[str, Any] = {"by": preparation.by, "floor": preparation.floor}
@@ -230,10 +239,16 @@ def _halve_stage(preparation: Refinement) -> Stage:
         newer, older = warped
         ones = jnp.ones_like(newer[..., :1])
         rough = ones if target.roughness is None else jnp.asarray(target.roughness, newer.dtype)
-        return {"inputs": (newer, older, jnp.where(jnp.isfinite(rough), rough, 1))}
+        inputs = (newer, older, jnp.where(jnp.isfinite(rough), rough, 1))
+        if not led:
+            return {"inputs": inputs}
+        lead = jnp.zeros((*newer.shape[:2], 3), newer.dtype)
+        if values["light_flow"] is not None:
+            lead = jnp.concatenate([half(values["light_flow"]) / 2, half(values["trust"])], -1).astype(newer.dtype)
+        return {"inputs": (*inputs, lead)}
 
     reads = ("since_oldest.motion", guides_of("history"))
-    takes = ("target", "sources", "motions")
+    takes = ("target", "sources", "motions", *(("light_flow?", "trust?") if led else ()))
     return Stage("halved warps", function, takes, ("inputs",), reads=reads, past=2, optional=True)
 
 
@@ -244,6 +259,8 @@ def extrass_refine(model: FRNet, *, preparation: Refinement = Refinement()) -> M
     the older one chained through the frames between. FRNet moves the newer one's light to where it is now: with the
     target's roughness, halved too, these are `values["inputs"]` before the stage "network". Where its answer differs
     from the guided warp at full size, and the surface is the same at both sizes, it is taken (`blend_mask`).
+
+    A network that is led begins with the flow of light that `shading_warp` finds, and the trust in it.
 
     What a scene lacks is left out: without a second rendered frame, or motion that leads there, the answer is the
     guided warp; where the newer and the older frame agree everywhere, no light moves, and no network runs; no albedo,
@@ -259,8 +276,10 @@ def extrass_refine(model: FRNet, *, preparation: Refinement = Refinement()) -> M
     """
     function, weights = inference(model)
     stages = (*refinement_stages(function, model.config, preparation, weights_of=lambda all: all), SKY)
-    given: dict[str, Any] = {"settings": Blend(changed=preparation.changed), "networks": {"network": function}}
-    return Method(REFINE_NAME, stages, past=2, weights=weights, **given)
+    how: Any = LedBlend if model.config.led else Blend
+    given: dict[str, Any] = {"settings": how(changed=preparation.changed), "networks": {"network": function}}
+    past = 3 if model.config.led else 2
+    return Method(REFINE_NAME, stages, past=past, weights=weights, **given)
 
 
 def refinement_stages(
@@ -280,8 +299,8 @@ def refinement_stages(
     """
 
     def network(state, values: Values):
-        newer, older, roughness = values["inputs"]
-        found = function(weights_of(state.weights), newer, older, roughness if config.roughness else None)
+        newer, older, roughness, *lead = values["inputs"]
+        found = function(weights_of(state.weights), newer, older, roughness if config.roughness else None, *lead)
         return {"refined": found.image, "moves": jnp.ones((), bool)}
 
     def blend(state, values: Values):
@@ -304,14 +323,16 @@ def refinement_stages(
         lambda state, values: jnp.any(values["inputs"][0] != values["inputs"][1]),
         lambda state, values: {"refined": values["inputs"][0], "moves": jnp.zeros((), bool)},
     )
+    moved = light_stages(preparation.space)[:-1] if config.led else ()  # FRNet moves it
     return (
-        reproject_stage(2),
+        reproject_stage(3 if config.led else 2),
         HOLES,
         demodulate_stage(preparation),
         guided_stage(preparation.space),
+        *moved,
         modulate_stage(preparation),
         Stage("guided frame", lambda state, values: {"guided": values["image"]}, ("image",), ("guided",)),
-        _halve_stage(preparation),
+        _halve_stage(preparation, led=config.led),
         Stage("network", network, ("inputs",), ("refined", "moves"), optional=True, past=2, needed=still),
         Stage("blend", blend, blended, ("image",), optional=True, past=2),
     )

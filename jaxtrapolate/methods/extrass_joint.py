@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from jaxtrapolate.methods.extranet import relative_depth
-from jaxtrapolate.methods.extrass import Blend, Refinement, refinement_stages
+from jaxtrapolate.methods.extrass import Blend, LedBlend, Refinement, refinement_stages
 from jaxtrapolate.methods.method import Method
 from jaxtrapolate.methods.options import option, settings
 from jaxtrapolate.methods.stage import Stage, Values
@@ -27,10 +27,20 @@ PREPARATION = Refinement()
 
 
 @settings
-class JointSettings(Blend):
-    """Of the refinement of extrapolated frames, and of the history."""
+class History:
+    """Of the history."""
 
     fetch: Filter = option("bilinear", "how the history is interpolated between pixels", choices=Filter)
+
+
+@settings
+class JointSettings(History, Blend):
+    """Of the refinement of extrapolated frames, and of the history."""
+
+
+@settings
+class LedJointSettings(History, LedBlend):
+    """And of the flow of light that FRNet begins with."""
 
 
 def extrass(model: ExtraSS, *, preparation: Refinement = PREPARATION) -> Method:
@@ -80,6 +90,7 @@ def extrass(model: ExtraSS, *, preparation: Refinement = PREPARATION) -> Method:
         most = jnp.maximum(jnp.max(color), jnp.max(previous))  # beyond it nothing is known, and the curve may end
         return kept(preparation.decode(jnp.clip(found.image, 0, most)), values["carry"])
 
+    how: Any = LedJointSettings if config.frnet.led else JointSettings
     both: dict[str, Any] = {"on": "both", "past": 0}
     stages = (
         RENDERED,
@@ -91,10 +102,10 @@ def extrass(model: ExtraSS, *, preparation: Refinement = PREPARATION) -> Method:
     return Method(
         NAME,
         stages,
-        past=2,
+        past=3 if config.frnet.led else 2,
         scale=scale,
         weights={"frnet": refining, "sampler": sampling},
-        settings=JointSettings(changed=preparation.changed),
+        settings=how(changed=preparation.changed),
         networks={"frnet": refine, "sampler": sample},
         start=starter(scale),
     )

@@ -36,12 +36,14 @@ class FRNetConfig:
         roughness: whether the target's roughness is an input.
         age: how many times as far as in the newer frame light has moved in the older one: 3 where frames are rendered
             every other time. Not used with `merge`.
+        led: whether it is handed a flow to begin with, and the trust in it; the paper's is not.
     """
 
     widths: tuple[int, ...] = (24, 36, 54, 72)
     merge: bool = False
     roughness: bool = True
     age: float = 3.0
+    led: bool = False
 
     @property
     def multiple(self) -> int:
@@ -70,7 +72,7 @@ class FRNet(nnx.Module):
 
     Args:
         config: its size, and what is left out of it.
-        rngs: `nnx.Rngs(params=...)`; at first it moves next to nothing.
+        rngs: `nnx.Rngs(params=...)`; at first it moves next to nothing, or by the flow that it is handed.
 
     References:
         Wu et al. 2023 (ExtraSS), section 4.3, eq. 4. What is ours says the module.
@@ -85,7 +87,7 @@ class FRNet(nnx.Module):
             self.encoder.append(nnx.Sequential(down, prelu_layer(after, after, rngs=rngs)))
         self.decoders = nnx.List([])
         for width, finer in pairwise((*config.widths[::-1], int(config.merge))):  # at last a mask, or nothing
-            inputs = 3 * width + flows if self.decoders else 2 * width
+            inputs = 3 * width + flows if self.decoders else 2 * width + 3 * config.led
             self.decoders.append(Decoder(inputs, width, flows + finer, rngs=rngs))
 
     def features(
@@ -113,11 +115,28 @@ class FRNet(nnx.Module):
             pyramid.append(value)
         return tuple(pyramid)
 
+    def _leads(self, lead: Array | None, size: tuple[int, int, int]) -> list[Array]:
+        """The flow that is trusted and the trust in it, at each level, the finest first; none without."""
+        if not self.config.led:
+            return []
+        lead = check_present("lead", lead, needed_by="this network")
+        check_array("lead", lead, shape=(*size, 3))
+        whole = pad_to_multiple(
+            jnp.concatenate([lead[..., :2] * lead[..., 2:], lead[..., 2:]], -1), self.config.multiple
+        )
+        levels = [whole]
+        for _ in self.config.widths:
+            batch, height, width, _ = levels[-1].shape
+            smaller = jnp.mean(levels[-1].reshape(batch, height // 2, 2, width // 2, 2, 3), (2, 4))
+            levels.append(jnp.concatenate([smaller[..., :2] / 2, smaller[..., 2:]], -1))
+        return levels
+
     def __call__(
         self,
         newer: Float[Array, "b h w 3"],
         older: Float[Array, "b h w 3"],
         roughness: Float[Array, "b h w 1"] | None = None,
+        lead: Float[Array, "b h w 3"] | None = None,
     ) -> Refined:
         """The refined frame.
 
@@ -126,6 +145,8 @@ class FRNet(nnx.Module):
                 the weights were trained in. Any size from 1 x 1 on: inside it is padded, see `pad_to_multiple`.
             older: the rendered frame before that, likewise.
             roughness: `[B, H, W, 1]`, of the target; `None` where the configuration has none.
+            lead: `[B, H, W, 3]`, a flow to begin with, in pixels to where the light is in the newer frame, and the
+                trust in it, 0..1: the network adds to their product. `None` where the configuration has none.
 
         Returns:
             `Refined`; the image in the dtype of the frames. Features are computed in the dtype of the parameters, the
@@ -154,17 +175,25 @@ class FRNet(nnx.Module):
                 return warp(pair[0], flow[..., :2]), warp(pair[1], flow[..., 2:])
             return warp(pair[0], flow), warp(pair[1], jnp.asarray(self.config.age, flow.dtype) * flow)
 
+        leads = self._leads(lead, (batch, height, width))
+
         def join(*parts):
             return jnp.concatenate([part.astype(parts[0].dtype) for part in parts], -1)
 
         count, predicted = 4 if merge else 2, []
         coarsest, *finer = self.decoders
-        code = coarsest(join(*pyramid.pop()))
-        flow = code[..., :count].astype(wide)
-        for decoder in finer:
+        code = coarsest(join(*pyramid.pop(), *(leads[len(finer) + 1 :] if leads else ())))
+        own = code[..., :count].astype(wide)
+
+        def whole(own, level):
+            return own if not leads else own + _of_both(leads[level], self.config).astype(wide)
+
+        for level in range(len(finer), 0, -1):
             predicted.append(code[..., count:])
-            code = decoder(join(code[..., count:], *fetch(pyramid.pop(), flow), flow))
-            flow = 2 * upsample_2x(flow, aligned=False) + code[..., :count].astype(wide)
+            flow = whole(own, level)
+            code = finer[-level](join(code[..., count:], *fetch(pyramid.pop(), flow), flow))
+            own = 2 * upsample_2x(own, aligned=False) + code[..., :count].astype(wide)
+        flow = whole(own, 0)
         if merge:
             a, b = fetch((first, second), flow)
             share = jax.nn.sigmoid(code[..., 4:].astype(wide))
@@ -173,3 +202,9 @@ class FRNet(nnx.Module):
             image = warp(first, flow)
         image, flow = (a[:, :height, :width] for a in (image, flow))
         return Refined(image.astype(newer.dtype), flow, tuple(predicted[::-1]), mean)
+
+
+def _of_both(lead: Array, config: FRNetConfig) -> Array:
+    """The flow that leads, for each frame that is warped."""
+    flow = lead[..., :2]
+    return jnp.concatenate([flow, config.age * flow], -1) if config.merge else flow

@@ -82,10 +82,10 @@ class FRNetOptions:
 class FRNetTask:
     """Trains an `FRNet` on what the method "extrass_refine" shows it. Where the sky is, nothing is learned.
 
-    An example holds the network's inputs "newer", "older" and "roughness", and "target", the true frame as they are, at
-    half size; NaN at the sky. For "blend" also, as `pixel_unshuffle` has it, "own", the guided warp at full size as
-    FRNet would see it, "divisor", the target's reflectance, "truth", the true frame after the tone curve, NaN at the
-    sky, "alike", eq. 6's first test, and for crops by error "weight".
+    An example holds the network's inputs "newer", "older" and "roughness", of a network that is led "lead", and
+    "target", the true frame as they are, at half size; NaN at the sky. For "blend" also, as `pixel_unshuffle` has it,
+    "own", the guided warp at full size as FRNet would see it, "divisor", the target's reflectance, "truth", the true
+    frame after the tone curve, NaN at the sky, "alike", eq. 6's first test, and for crops by error "weight".
 
     References: Wu et al. 2023 (ExtraSS), eq. 7-9. Eq. 7 is taken of the network's own answer: as printed it is of the
     guided warp, which has no parameters. The truth's features are held, see `feature_census_loss`.
@@ -111,13 +111,15 @@ class FRNetTask:
         del key
         method = self._stages
         values = method.values_before("network", method.state, (), window.history, window.target)
-        newer, older, roughness = values["inputs"]
+        newer, older, roughness, *lead = values["inputs"]
         buffers = check_present("gbuffer", window.truth.gbuffer, needed_by="training")
         color = check_present("color", window.truth.color, needed_by="training")
         target = encoded_truth(color, buffers, preparation=self.options.preparation)
         if buffers.sky is not None:
             target = jnp.where(half(buffers.sky) > 0.5, jnp.nan, target)
         example = {"newer": newer, "older": older, "roughness": roughness, "target": target.astype(newer.dtype)}
+        if lead:
+            example["lead"] = lead[0]
         return example if self.options.loss == "answer" else example | self._whole(values, window, color)
 
     def _whole(self, values: Values, window: Window, color: Array) -> Example:
@@ -202,6 +204,6 @@ def _predict(model: Any, batch: Batch) -> tuple[Any, tuple[Array, ...]]:
     """What the network says, and what its encoder makes of the truth, where that is known, at the same levels."""
     newer, older, target = (batch[name] for name in ("newer", "older", "target"))
     roughness = batch["roughness"] if model.config.roughness else None
-    found = model(newer, older, roughness)
+    found = model(newer, older, roughness, batch.get("lead"))
     truth = model.features(jnp.where(jnp.isfinite(target), target, newer), roughness, found.mean)
     return found, truth[: len(found.features)]
