@@ -94,8 +94,43 @@ _RENAMED = {"extranet": "guided_net"}
 _MEASURED = {"czest1dm": "path-traced map", "torcs": "cars", "bunker": "engine clip"}
 
 
+CAUSES = ("border", "hole", "shadow", "glossy", "edge", "rest")
+
+
 LIGHT = ("guided_warp", "shading_warp", "guided_net", "bidirectional_guided", "bidirectional_shading")
 """Methods without and with the light's own motion."""
+
+
+def by_scene_and_cause(names: Sequence[str]) -> str:
+    """dB of methods by scene and cause, one after the other, the mean over a scene's test seeds."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for name, methods in _found("test_seeds")["inputs"].items():
+        if not any(method["psnr"] == "inf" for method in methods.values()):
+            found.setdefault(name.rpartition("-")[0], []).append(methods)
+    causes = list(_found("test_seeds")["methods"][names[0]]["by_cause"])
+
+    def cell(sequences: list[dict[str, Any]], name: str, cause: str) -> str:
+        values = [by[cause]["psnr"] for s in sequences if cause in (by := s[name]["by_cause"])]
+        return f"{fmean(values):.1f}" if values else ""
+
+    rows = []
+    for scene, sequences in found.items():
+        cells = [" / ".join(cell(sequences, name, cause) for name in names) for cause in causes]
+        rows.append([scene, *(text if text.strip(" /") else "" for text in cells)])
+    return table([" / ".join(names), *causes], rows)
+
+
+def error_shares(names: Sequence[str]) -> str:
+    """Which share of the squared error each cause has, in per cent, on test seeds and measured inputs."""
+    titles = {"test_seeds": "embedded scenes"} | {f"{name}_both": title for name, title in _MEASURED.items()}
+    rows = []
+    for run, title in titles.items():
+        for name in names:
+            by_cause = _found(run)["methods"][name]["by_cause"]
+            errors = {cause: entry["share"] * 10 ** (-entry["psnr"] / 10) for cause, entry in by_cause.items()}
+            shares = [100 * errors[cause] / sum(errors.values()) if cause in errors else None for cause in CAUSES]
+            rows.append([title, name, *("" if share is None else f"{share:.0f}" for share in shares)])
+    return table(["% of the squared error", "", *CAUSES], rows)
 
 
 def both_sides() -> str:
@@ -137,6 +172,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "both-sides": both_sides,
     "light": partial(by_scene, LIGHT),
     "light-causes": partial(by_cause, LIGHT),
+    "light-scenes": partial(by_scene_and_cause, LIGHT[:3]),
+    "light-errors": partial(error_shares, LIGHT[:3]),
     "before": before,
 }
 """Each by its name in the pages."""

@@ -386,7 +386,10 @@ EVERYWHERE = 10**6
 
 
 def reach(tree: Any, usual: Any, place: tuple[int, int]) -> int:
-    """How many pixels from a place what is not finite lies, and is usually; -1 where there is nothing of it."""
+    """How many pixels from a place what is not finite lies, and is usually; -1 where there is nothing of it.
+
+    The place is the middle. Of a result that is larger than the argument they are the argument's pixels.
+    """
     farthest = -1
     for array, other in zip(jax.tree.leaves(tree), jax.tree.leaves(usual), strict=True):
         array, other = (np.asarray(a, np.float64) for a in (array, other))
@@ -396,6 +399,8 @@ def reach(tree: Any, usual: Any, place: tuple[int, int]) -> int:
         if array.ndim < 3 or array.shape[-2:] == (4, 4):
             return EVERYWHERE
         *_, rows, columns = np.nonzero(spoilt.any(-1))  # of a run of images, in any of them
+        scale = max(1, round(spoilt.shape[-3] / (2 * place[0] + 1)))
+        rows, columns = rows // scale, columns // scale
         farthest = max(farthest, int(np.abs(rows - place[0]).max()), int(np.abs(columns - place[1]).max()))
     return farthest
 
