@@ -21,7 +21,8 @@ def size_of(name: str) -> tuple[int, int]:
 class Inputs:
     """float32 `[H, W, C]` arrays of NumPy; motion leads from the target frame to the source frame.
 
-    gray and moved_gray, 0..1, are of a texture that the motion leads from the one to the other.
+    gray and moved_gray, 0..1, are of a texture that the motion leads from the one to the other; normal is a part of
+    target_guide.
     """
 
     image: np.ndarray
@@ -33,6 +34,7 @@ class Inputs:
     source_guide: np.ndarray
     gray: np.ndarray
     moved_gray: np.ndarray
+    normal: np.ndarray
 
 
 def make_inputs(height: int, width: int, *, seed: int = 0) -> Inputs:
@@ -76,15 +78,17 @@ def make_inputs(height: int, width: int, *, seed: int = 0) -> Inputs:
     def texture(x, y):
         return 0.5 + sum(0.12 * np.sin(k * (0.11 * x + 0.07 * y)) * np.cos(k * 0.05 * y) for k in (1.0, 1.7, 2.3))
 
+    target_guide = guide(*there, ahead)
     arrays = {
         "image": image,
         "motion": motion,
         "older": older,
         "depth": depth,
         "importance": -depth,
-        "target_guide": guide(*there, ahead),
+        "target_guide": target_guide,
         "source_guide": guide(x, y, front(x - shift[0], y - shift[1])),
         "gray": texture(*there)[..., None],
         "moved_gray": texture(x, y)[..., None],
+        "normal": target_guide[..., :3],
     }
     return Inputs(**{name: np.ascontiguousarray(a, np.float32) for name, a in arrays.items()})

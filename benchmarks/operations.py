@@ -201,6 +201,13 @@ OPERATIONS = (
         )
         for preset in ("ultrafast", "fast", "medium")
     ),
+    Operation(
+        "shading_flow",
+        lambda newer, older, guide: jt.shading_flow(newer, older, guide=guide),
+        ("gray", "moved_gray", "normal"),
+        gpu_tolerance=0.1,
+        gpu_share=0.02,
+    ),
     _guided(0.05, 1.0, "float32"),
     _guided(0.05, 1.0, "packed"),
     _guided(0.005, 10.0, "float32"),

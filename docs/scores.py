@@ -35,8 +35,8 @@ def evaluated(name: str) -> str:
     return table(["method", *columns], rows)
 
 
-PAST = ("repeat", "warp", "reproject", "warp_3d", "grid_extrapolate", "extranet", "occlusion_warp", "guided_warp")
-PAST += ("shading_warp", "guided_net")
+PAST = ("repeat", "warp", "reproject", "warp_3d", "grid_extrapolate", "extranet", "occlusion_warp", "extrass_warp")
+PAST += ("guided_warp", "extrass_refine", "shading_warp", "guided_net")
 """Methods that use the past alone, in the order of their tables."""
 
 BOTH = ("blend", "half_motion", "grid_warp", "dis", "softmax_splat", "interpolator")
@@ -57,7 +57,7 @@ def _found(name: str) -> dict[str, Any]:
     """What was found on an input in several runs: of methods that have changed since a run, what the next says."""
     methods: dict[str, Any] = {}
     inputs: dict[str, dict[str, Any]] = {}
-    for run in (name, f"{name}_light", f"{name}_extranet"):
+    for run in (name, f"{name}_light", f"{name}_extranet", f"{name}_refine"):
         if not (ROOT / f"experiments/results/evaluated/{run}.json").exists():
             continue
         found = read(f"experiments/results/evaluated/{run}.json")
@@ -136,7 +136,7 @@ def error_shares(names: Sequence[str]) -> str:
 def both_sides() -> str:
     """dB of methods that know the next frame too, on measured inputs."""
     found = {name: _found(f"{name}_both")["methods"] for name in _MEASURED}
-    names = [*BOTH, "extranet", "guided_warp", "shading_warp", "guided_net"]
+    names = [*BOTH, "extranet", "extrass_warp", "guided_warp", "extrass_refine", "shading_warp", "guided_net"]
     columns = [[methods[name]["psnr"] for name in names] for methods in found.values()]
     titles = [f"{name} (from one side)" if name in PAST else name for name in names]
     return table(["dB", *_MEASURED.values()], [list(row) for row in zip(titles, *_best(columns), strict=True)])

@@ -129,6 +129,20 @@ def operations() -> str:
     return table(["operation, float32", "360p ms", "720p ms", "1080p ms", "ratios at 1080p"], rows)
 
 
+def flows() -> str:
+    """Milliseconds of dense flows, OpenCV's beside them, and of what they are measured by."""
+    rows = []
+    found = {(r["operation"], r["size"]): r for r in read("benchmarks/results/cpu_1_thread_flows.json")["operations"]}
+    for name in dict.fromkeys(name for name, _ in found):
+        cells = []
+        for size in ("360p", "720p", "1080p"):
+            peer = found[name, size]["peers"].get("cv2", {})
+            cells += [f"{found[name, size]['ms']['median']:.0f}", f"{peer['ratio']:.2f}" if "ratio" in peer else ""]
+        rows.append([f"`{name}`", *cells])
+    head = [text for size in ("360p", "720p", "1080p") for text in (f"{size} ms", "ours / cv2")]
+    return table(["one thread, memory kept", *head], rows)
+
+
 def networks() -> str:
     """Milliseconds of networks, and ratios to their peers."""
     names = {"extranet": "ExtraNet, light gates", "extranet, full gates": "full gates"}
@@ -272,6 +286,7 @@ def noted(name: str) -> str:
 
 
 _BY_SIZE = {name: name for name in ("warp", "occlusion_warp", "guided_warp", "warp_3d", "grid_extrapolate")} | {
+    "shading_warp": "shading_warp",
     "guided_net": "**guided_net**",
     "interpolator": "interpolator (both sides)",
     "bidirectional": "bidirectional (both sides)",
@@ -290,32 +305,27 @@ def sizes() -> str:
     return table(["", *head], rows)
 
 
-_STAGES = {
-    "reproject three histories": ("reproject",),
-    "occlusion motion": ("occlusion motion",),
-    "hole masks": ("holes",),
-    "demodulate": ("demodulate",),
-    "warp": ("warp",),
-    "guided warp": ("guided warp",),
-    "the network's inputs": ("inputs",),
-    "network": ("network",),
-    "modulate, sky": ("modulate", "warped sky"),
-}
-_ALONE = {"*networks alone:* the paper's, light gates": "light gates", "full gates": "full gates"}
+def stage_times(method: str) -> str:
+    """Milliseconds of a method's stages by resolution."""
+    times = read("experiments/results/resolutions.json")["times"]
+    stages = {name: None for found in times.values() for name in found[f"{method}'s stages"]}
+    rows = [
+        [name, *(milliseconds(found[f"{method}'s stages"].get(name, 0)) for found in times.values())] for name in stages
+    ]
+    return table([f"{method} by stage, ms", *times], rows)
+
+
+_ALONE = {"the paper's, light gates": "light gates", "full gates": "full gates"}
 _ALONE |= {"full gates, no histories (GC)": "full gates, no histories (GC)"}
 
 
-def stage_times() -> str:
-    """Milliseconds of ExtraNet's stages, and of its networks alone, by resolution."""
+def gate_times() -> str:
+    """Milliseconds of networks alone, by resolution."""
     times = read("experiments/results/resolutions.json")["times"]
     rows = [
-        [title, *(milliseconds(sum(found["guided_net's stages"][name] for name in names)) for found in times.values())]
-        for title, names in _STAGES.items()
-    ]
-    rows += [
         [title, *(milliseconds(found["networks"][name]) for found in times.values())] for title, name in _ALONE.items()
     ]
-    return table(["guided_net by stage, ms", *times], rows)
+    return table(["networks alone, ms", *times], rows)
 
 
 def _extreme(part: str) -> str:
@@ -385,6 +395,7 @@ TABLES: dict[str, Callable[[], str]] = scores.TABLES | {
     "quality": quality,
     "guided": guided,
     "operations": operations,
+    "flows": flows,
     "networks": networks,
     "scenes": scenes,
     "reach": reach,
@@ -395,8 +406,11 @@ TABLES: dict[str, Callable[[], str]] = scores.TABLES | {
     "extranet-curve": extranet_curve,
     "rounds": partial(noted, "rounds"),
     "recipes": partial(noted, "recipes"),
+    "frnet": partial(noted, "frnet"),
     "sizes": sizes,
-    "stage-times": stage_times,
+    "stage-times": partial(stage_times, "guided_net"),
+    "shading-times": partial(stage_times, "shading_warp"),
+    "gate-times": gate_times,
     "masks": masks,
 }
 

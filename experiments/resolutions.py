@@ -1,11 +1,11 @@
-"""guided_net by resolution: its stages' times, other methods' times, its error, light gates against full ones.
+"""guided_net and shading_warp by resolution: their stages' times, others' times, errors, light gates against full ones.
 
     python experiments/resolutions.py --output experiments/results/resolutions.json
 
 Tables 5 and 6, sections 6.4 and 6.5 of Guo et al. 2021. A held-back frame of a development seed is generated at
-854x480, 1280x720 and 1920x1080 by networks that were trained on frames of 320x180. Times are medians of one frame, on
-all cores of one device, and means over the scenes. `--times` or `--errors` alone do one half: times need a machine that
-is quiet.
+640x360, 854x480, 1280x720 and 1920x1080 by networks that were trained on frames of 320x180. Times are medians of one
+frame, on all cores of one device, and means over the scenes. `--times` or `--errors` alone do one half: times need a
+machine that is quiet.
 """
 
 import argparse
@@ -29,9 +29,10 @@ from jaxtrapolate.networks.extranet import GATED_CONVOLUTION, ExtraNet, ExtraNet
 from jaxtrapolate.runtime.timing import machine, measure, measure_pairs
 from jaxtrapolate.scenes import DEVELOPMENT_SEEDS, SceneSequence
 
-SIZES = {"480p": (480, 854), "720p": (720, 1280), "1080p": (1080, 1920)}
+SIZES = {"360p": (360, 640), "480p": (480, 854), "720p": (720, 1280), "1080p": (1080, 1920)}
 METHODS = ("warp", "occlusion_warp", "guided_warp", "warp_3d", "grid_extrapolate", "bidirectional", "interpolator",
-           "guided_net")  # fmt: skip
+           "shading_warp", "guided_net")  # fmt: skip
+BY_STAGE = ("shading_warp", "guided_net")
 GATES = {
     "light gates": ExtraNetConfig(),
     "full gates": ExtraNetConfig(gate="full"),
@@ -112,18 +113,21 @@ def main() -> None:
 
 def _times(known: dict[str, Method], here: list[Window], repeats: int) -> dict[str, Any]:
     whole: dict[str, list[float]] = {name: [] for name in known}
-    stages: dict[str, list[float]] = {}
+    stages: dict[str, dict[str, list[float]]] = {}
     for window in here:
         for name, method in known.items():
             given = arguments(method, window)
             whole[name].append(measure(lambda m=method, g=given: m.step(m.init(*g[:2]), *g), repeats=repeats).median)
-        if "guided_net" in known:
-            for stage, timing in time_stages(known["guided_net"], window, repeats=repeats).items():
-                stages.setdefault(stage, []).append(timing.median)
+        for name in BY_STAGE:
+            for stage, timing in time_stages(known[name], window, repeats=repeats).items():
+                stages.setdefault(name, {}).setdefault(stage, []).append(timing.median)
     means = {name: float(np.mean(values)) for name, values in whole.items()}
-    by_stage = {name: float(np.mean(values)) for name, values in stages.items()}
+    by_stage = {
+        f"{name}'s stages": {stage: float(np.mean(values)) for stage, values in found.items()}
+        for name, found in stages.items()
+    }
     print(means, by_stage, flush=True)
-    return {"whole": means, "guided_net's stages": by_stage, "networks": gates(here[0], repeats)}
+    return {"whole": means, **by_stage, "networks": gates(here[0], repeats)}
 
 
 def _print(content: dict[str, Any]) -> None:
@@ -135,7 +139,11 @@ def _print(content: dict[str, Any]) -> None:
                 table.add_column(column)
             rows: dict[str, list[str]] = {}
             for found in sizes.values():
-                stages = {f"guided_net: {name}": ms for name, ms in found.get("guided_net's stages", {}).items()}
+                stages = {
+                    f"{name}: {stage}": ms
+                    for name in BY_STAGE
+                    for stage, ms in found.get(f"{name}'s stages", {}).items()
+                }
                 by_name = found if kind == "errors" else found["whole"] | stages | found["networks"]
                 for name, entry in by_name.items():
                     rows.setdefault(name, []).append(f"{entry[value] if kind == 'errors' else entry:.2f}")

@@ -13,7 +13,6 @@ import jaxtrapolate as jx
 from jaxtrapolate.evaluation.windows import Window
 from jaxtrapolate.methods.extrass import Refinement
 from jaxtrapolate.networks import FRNet, FRNetConfig
-from jaxtrapolate.networks.blocks import pixel_shuffle
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.records import replace
 from jaxtrapolate.training import Config, Optimizer, load_config, train_and_evaluate
@@ -70,15 +69,16 @@ def test_the_loss_written_out(example):
 
 
 @pytest.mark.slow
-def test_the_blend_that_is_trained_is_the_frame_that_the_method_makes(example):
+@pytest.mark.parametrize("taken", ["change", "flow"])
+def test_the_blend_that_is_trained_is_the_frame_that_the_method_makes(example, taken):
     _, window, _ = example
-    preparation = Refinement(modulated=False, taken="change", changed=0.0)
+    preparation = Refinement(modulated=False, taken=taken, changed=0.0)
     options = dataclasses.replace(OPTIONS, preparation=preparation, loss="blend", crops="error", crop=(8, 8))
     task, model = FRNetTask(options), random_model(SMALL, FRNet)
     made = jax.jit(task._prepare)(window, jax.random.key(0))
     batch = jax.tree.map(lambda a: a[None], made)
     found = nnx.jit(FRNet.__call__)(model, batch["newer"], batch["older"], batch["roughness"])
-    blended, truth, guess = (np.float64(pixel_shuffle(a))[0, :25, :33] for a in task._blended(found.image, batch))
+    blended, truth, guess = (np.float64(a)[0, :25, :33] for a in task._blended(found, batch))
     method = task._stages.with_weights(inference(model)[1])
     image = np.maximum(np.float64(jax.jit(method.__call__)(window.history, window.target)), 0)
     known = np.isfinite(truth)

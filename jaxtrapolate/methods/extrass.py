@@ -33,10 +33,12 @@ from jaxtrapolate.methods.stages import (
     reproject_stage,
 )
 from jaxtrapolate.methods.warping import Guide, fetch_guided, guided_stage, guides_of
+from jaxtrapolate.networks.blocks import upsample_2x
 from jaxtrapolate.networks.frnet import FRNet, FRNetConfig, Refined
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.networks.stored import load_network
 from jaxtrapolate.ops.radiance import By, compress, demodulate, expand, log_decode, log_encode, modulate
+from jaxtrapolate.ops.warp import backward_warp
 from jaxtrapolate.precision import divide, widest
 from jaxtrapolate.records import GBuffer
 from jaxtrapolate.weights import configured
@@ -44,7 +46,7 @@ from jaxtrapolate.weights import configured
 WARP_NAME, REFINE_NAME = "extrass_warp", "extrass_refine"
 
 Curve = Literal["tone", "log"]
-Taken = Literal["light", "change"]
+Taken = Literal["light", "change", "flow"]
 
 
 @settings
@@ -83,7 +85,8 @@ class Refinement:
         curve: in which values it sees them: "tone", `compress`, or "log", `log_encode`.
         space: in which colours are fetched between pixels.
         taken: what of FRNet's answer is taken: "light", itself, as in the paper, or "change", what it has changed of
-            its newer input, which is added to the guided warp at full size, whose detail stays.
+            its newer input, which is added to the guided warp at full size, whose detail stays; or "flow", where it
+            has moved light, by which the guided warp is moved at full size. The latter two are ours.
         changed: from which relative difference to the guided warp on it is taken; the option `changed` begins there.
     """
 
@@ -152,16 +155,26 @@ def _step(x: Array, softness: Array) -> Array:
 
 
 def taken(
-    preparation: Refinement, own: Float[Array, "*n"], before: Float[Array, "*n"], after: Float[Array, "*n"]
-) -> Float[Array, "*n"]:
-    """What FRNet's answer makes of the guided warp, all as `encode` has it.
+    preparation: Refinement,
+    own: Float[Array, "h w c"],
+    before: Float[Array, "i j c"],
+    after: Float[Array, "i j c"],
+    flow: Float[Array, "i j f"],
+) -> Float[Array, "h w c"]:
+    """What FRNet's answer makes of the guided warp, images as `encode` has them.
 
     Args:
         preparation: whose `taken` says it.
         own: the guided warp at full size.
-        before: the newer image that FRNet was shown, doubled.
-        after: its answer, doubled.
+        before: the newer image that FRNet was shown, at half size.
+        after: its answer.
+        flow: its flow.
     """
+    if preparation.taken == "flow":
+        height, width = own.shape[:2]
+        larger = 2 * upsample_2x(flow[None], aligned=False)[0, :height, :width]
+        return backward_warp(own, larger.astype(own.dtype))
+    before, after = (doubled(image, own) for image in (before, after))
     if preparation.taken == "light":
         return after
     return jnp.clip(own + (after - before), 0, jnp.maximum(own, jnp.maximum(before, after)))
@@ -298,17 +311,20 @@ def refinement_stages(
         weights_of: takes its weights out of the method's.
     """
 
+    if config.merge and preparation.taken == "flow":
+        raise ValueError('taken: "flow" is of a network that moves the newer frame alone, without merge')
+
     def network(state, values: Values):
         newer, older, roughness, *lead = values["inputs"]
         found = function(weights_of(state.weights), newer, older, roughness if config.roughness else None, *lead)
-        return {"refined": found.image, "moves": jnp.ones((), bool)}
+        return {"refined": found.image, "refined_flow": found.flow, "moves": jnp.ones((), bool)}
 
     def blend(state, values: Values):
         target, warped = values["target"].gbuffer, values["image"]
         divided = not preparation.modulated and have_albedo(target, *(s.gbuffer for s in values["sources"]))
         own = preparation.encode(values["warped"] if divided else warped)
-        before, after = (doubled(a, own) for a in (values["inputs"][0], values["refined"]))
-        light = preparation.decode(taken(preparation, own, before, after))
+        answer = values["inputs"][0], values["refined"], values["refined_flow"]
+        light = preparation.decode(taken(preparation, own, *answer))
         if divided:
             buffers = reflecting(target, preparation.sky)
             light = modulate(light, buffers, by=preparation.by, floor=preparation.floor)
@@ -317,12 +333,14 @@ def refinement_stages(
         mixed = light * mask + warped.astype(light.dtype) * (1 - mask)
         return {"image": jnp.where(mask > 0, mixed, warped).astype(warped.dtype)}
 
-    blended = ("image", "warped", "inputs", "refined", "moves", "sources", "target")
-    still = Needed(
-        "light moves",
-        lambda state, values: jnp.any(values["inputs"][0] != values["inputs"][1]),
-        lambda state, values: {"refined": values["inputs"][0], "moves": jnp.zeros((), bool)},
-    )
+    def unmoved(state, values: Values):
+        newer = values["inputs"][0]
+        flow = jnp.zeros((*newer.shape[:2], 4 if config.merge else 2), widest(newer))
+        return {"refined": newer, "refined_flow": flow, "moves": jnp.zeros((), bool)}
+
+    given = ("refined", "refined_flow", "moves")
+    blended = ("image", "warped", "inputs", *given, "sources", "target")
+    still = Needed("light moves", lambda state, values: jnp.any(values["inputs"][0] != values["inputs"][1]), unmoved)
     moved = light_stages(preparation.space)[:-1] if config.led else ()  # FRNet moves it
     return (
         reproject_stage(3 if config.led else 2),
@@ -333,7 +351,9 @@ def refinement_stages(
         modulate_stage(preparation),
         Stage("guided frame", lambda state, values: {"guided": values["image"]}, ("image",), ("guided",)),
         _halve_stage(preparation, led=config.led),
-        Stage("network", network, ("inputs",), ("refined", "moves"), optional=True, past=2, needed=still),
+        Stage(
+            "network", network, ("inputs",), ("refined", "refined_flow", "moves"), optional=True, past=2, needed=still
+        ),
         Stage("blend", blend, blended, ("image",), optional=True, past=2),
     )
 

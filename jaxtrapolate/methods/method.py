@@ -75,6 +75,7 @@ class Method:
         scale: output size over input size.
         weights: a pytree.
         settings: its options, an instance of a class that `jaxtrapolate.methods.options.settings` decorates.
+        defaults: its options as it was made, which weights may say; `None` = `settings`.
         dtype: what the stages work in: colours and buffers are cast to it, and the image to what the colours were in.
             Motion, depth, position, stencil, cameras and times keep their dtype. `None` = nothing is cast.
         networks: the networks on their own, by name: pure functions `(weights, *inputs) -> output` of one frame.
@@ -90,11 +91,14 @@ class Method:
     scale: int = 1
     weights: Any = ()
     settings: Any = ()
+    defaults: Any = None
     dtype: Precision | None = None
     networks: Mapping[str, Callable[..., Any]] = dataclasses.field(default_factory=dict)
     start: Callable[[Frames, Frame], Any] | None = None
 
     def __post_init__(self):
+        if self.defaults is None:
+            object.__setattr__(self, "defaults", self.settings)
         if self.dtype is not None:
             check_choice("dtype", self.dtype, get_args(Precision))
         names = [stage.name for stage in self.stages]
@@ -143,7 +147,7 @@ class Method:
     @property
     def options(self) -> tuple[Option, ...]:
         """Its options: name, default, current value, range or choices, whether static, and what they do."""
-        return options_of(self.settings)
+        return options_of(self.settings, self.defaults)
 
     def replace(self, **options: Any) -> "Method":
         """This method with other options; real-valued ones change without compiling anew.

@@ -149,12 +149,20 @@ def settings(cls: type[S]) -> type[S]:
     return jax.tree_util.register_dataclass(cls, data_fields=traced, meta_fields=static)
 
 
-def options_of(given: Any) -> tuple[Option, ...]:
-    """The options of a class that `settings` decorates, with their current values; none of anything else."""
+def options_of(given: Any, defaults: Any = None) -> tuple[Option, ...]:
+    """The options of a class that `settings` decorates, with their current values; none of anything else.
+
+    Their defaults are the values in `defaults`, of the same class, or without it the class's own.
+    """
     if not dataclasses.is_dataclass(given):
         return ()
     return tuple(
-        Option(field.name, field.default, getattr(given, field.name), **field.metadata["option"])
+        Option(
+            field.name,
+            field.default if defaults is None else getattr(defaults, field.name),
+            getattr(given, field.name),
+            **field.metadata["option"],
+        )
         for field in dataclasses.fields(given)
     )
 

@@ -26,8 +26,8 @@ from jaxtrapolate.methods.extrass import (
 )
 from jaxtrapolate.methods.stage import Values
 from jaxtrapolate.methods.stages import reflecting
-from jaxtrapolate.networks.blocks import pixel_unshuffle
-from jaxtrapolate.networks.frnet import FRNet, FRNetConfig
+from jaxtrapolate.networks.blocks import pixel_shuffle, pixel_unshuffle
+from jaxtrapolate.networks.frnet import FRNet, FRNetConfig, Refined
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.ops.radiance import compress, demodulation_divisor
 from jaxtrapolate.training.augment import crop
@@ -139,11 +139,10 @@ class FRNetTask:
         if self.options.crops == "error":
             off = jnp.square(compress(preparation.decode(own) * divisor) - truth)
             whole["weight"] = jnp.mean(jnp.nan_to_num(off), -1, keepdims=True)
-        odd = [(0, n % 2) for n in own.shape[:2]]
-        beyond = {"truth": jnp.nan}
+        odd = (*((0, n % 2) for n in own.shape[:2]), (0, 0))
+        modes: dict[str, dict[str, Any]] = {"own": {"mode": "edge"}, "truth": {"constant_values": jnp.nan}}
         packed = {
-            name: pixel_unshuffle(jnp.pad(a, (*odd, (0, 0)), constant_values=beyond.get(name, 0))[None])[0]
-            for name, a in whole.items()
+            name: pixel_unshuffle(jnp.pad(image, odd, **modes.get(name, {}))[None])[0] for name, image in whole.items()
         }
         if "weight" in packed:
             packed["weight"] = jnp.sum(packed["weight"], -1, keepdims=True)
@@ -169,7 +168,7 @@ class FRNetTask:
         """
         found, truth = _predict(model, batch)
         if self.options.loss == "blend":
-            share = jnp.mean(jax.vmap(relative_loss)(*self._blended(found.image, batch)))
+            share = jnp.mean(jax.vmap(relative_loss)(*self._blended(found, batch)))
             return share, {"share": share}
         parts = {
             "charbonnier": jax.vmap(charbonnier_loss)(found.image, batch["target"]),
@@ -181,15 +180,13 @@ class FRNetTask:
         total = means["charbonnier"] + o.census_weight * means["census"] + o.feature_weight * means["feature"]
         return total, means
 
-    def _blended(self, answer: Array, batch: Batch) -> tuple[Array, Array, Array]:
+    def _blended(self, found: Refined, batch: Batch) -> tuple[Array, Array, Array]:
         """The frame that is made of the network's answer, the true one and the guided warp, after the tone curve."""
         preparation = self.options.preparation
-        before, after = (jnp.tile(a, 4) for a in (batch["newer"], answer))
-        made, guess = (
-            compress(preparation.decode(light) * batch["divisor"])
-            for light in (taken(preparation, batch["own"], before, after), batch["own"])
-        )
-        return jnp.where(jnp.repeat(batch["alike"], 3, -1) > 0, made, guess), batch["truth"], guess
+        own, divisor, truth, same = (pixel_shuffle(batch[name]) for name in ("own", "divisor", "truth", "alike"))
+        moved = jax.vmap(lambda *images: taken(preparation, *images))(own, batch["newer"], found.image, found.flow)
+        made, guess = (compress(preparation.decode(light) * divisor) for light in (moved, own))
+        return jnp.where(same > 0, made, guess), truth, guess
 
     def validate(self, model: nnx.Module) -> tuple[Mapping[str, float], Mapping[str, Any]]:
         """dB of the method's frames: "psnr"; "warp", of the guided warp alone, and "gain" over that."""
