@@ -268,15 +268,16 @@ def curve() -> str:
 
 
 def extranet_curve() -> str:
-    """The validation gain of the paper's network over its first guess, the plain warp."""
-    lines = read("experiments/results/extranet_training.jsonl")
-    found = {line["step"]: line for line in lines if line["kind"] == "validation"}
-    steps = range(1000, max(found) + 1, 2000)
-    gains = {
-        "whole": [found[step]["gain"] for step in steps],
-        "holes": [found[step]["psnr_hole"] - found[step]["guess_hole"] for step in steps],
-    }
-    return table(["step", *map(str, steps)], [[part, *(f"{v:.2f}" for v in values)] for part, values in gains.items()])
+    """The validation gain of the paper's network over its first guess, the plain warp, in both runs."""
+    lines = [line for line in read("experiments/results/extranet_training.jsonl") if line["kind"] == "validation"]
+    steps, rows = (1000, 3000, 5000, 7000, 9000, 11000, 13000, 15000, 17000, 19000, 20000, 21000, 22000), []
+    for number in (1, 2):
+        found = {line["step"]: line for line in lines if line["round"] == number}
+        gains = {step: (line["gain"], line["psnr_hole"] - line["guess_hole"]) for step, line in found.items()}
+        for k, part in enumerate(("whole", "holes")):
+            cells = (f"{gains[step][k]:.2f}" if step in gains else "" for step in steps)
+            rows.append([f"{number}: {part}", *cells])
+    return table(["step", *map(str, steps)], rows)
 
 
 def noted(name: str) -> str:
@@ -286,7 +287,6 @@ def noted(name: str) -> str:
 
 
 _BY_SIZE = {name: name for name in ("warp", "occlusion_warp", "guided_warp", "warp_3d", "grid_extrapolate")} | {
-    "shading_warp": "shading_warp",
     "guided_net": "**guided_net**",
     "interpolator": "interpolator (both sides)",
     "bidirectional": "bidirectional (both sides)",
@@ -305,27 +305,49 @@ def sizes() -> str:
     return table(["", *head], rows)
 
 
-def stage_times(method: str) -> str:
-    """Milliseconds of a method's stages by resolution."""
-    times = read("experiments/results/resolutions.json")["times"]
-    stages = {name: None for found in times.values() for name in found[f"{method}'s stages"]}
-    rows = [
-        [name, *(milliseconds(found[f"{method}'s stages"].get(name, 0)) for found in times.values())] for name in stages
-    ]
-    return table([f"{method} by stage, ms", *times], rows)
+_STAGES = {
+    "reproject three histories": ("reproject",),
+    "occlusion motion": ("occlusion motion",),
+    "hole masks": ("holes",),
+    "demodulate": ("demodulate",),
+    "warp": ("warp",),
+    "guided warp": ("guided warp",),
+    "the network's inputs": ("inputs",),
+    "network": ("network",),
+    "modulate, sky": ("modulate", "warped sky"),
+}
 
 
-_ALONE = {"the paper's, light gates": "light gates", "full gates": "full gates"}
+_ALONE = {"*networks alone:* the paper's, light gates": "light gates", "full gates": "full gates"}
 _ALONE |= {"full gates, no histories (GC)": "full gates, no histories (GC)"}
 
 
-def gate_times() -> str:
-    """Milliseconds of networks alone, by resolution."""
+def stage_times() -> str:
+    """Milliseconds of guided_net's stages, and of its networks alone, by resolution."""
     times = read("experiments/results/resolutions.json")["times"]
     rows = [
+        [title, *(milliseconds(sum(found["guided_net's stages"][name] for name in names)) for found in times.values())]
+        for title, names in _STAGES.items()
+    ]
+    rows += [
         [title, *(milliseconds(found["networks"][name]) for found in times.values())] for title, name in _ALONE.items()
     ]
-    return table(["networks alone, ms", *times], rows)
+    return table(["guided_net by stage, ms", *times], rows)
+
+
+def shading_times() -> str:
+    """Milliseconds of shading_warp's stages by resolution, the guided warp's beside them."""
+    times = read("experiments/results/shading_times.json")["times"]
+    stages = {stage: None for found in times.values() for stage in found["shading_warp's stages"]}
+    rows = [
+        [stage, *(milliseconds(found["shading_warp's stages"].get(stage, 0)) for found in times.values())]
+        for stage in stages
+    ]
+    rows += [
+        [f"*{name}, whole*", *(milliseconds(found["whole"][name]) for found in times.values())]
+        for name in ("guided_warp", "shading_warp")
+    ]
+    return table(["shading_warp by stage, ms", *times], rows)
 
 
 def _extreme(part: str) -> str:
@@ -408,9 +430,8 @@ TABLES: dict[str, Callable[[], str]] = scores.TABLES | {
     "recipes": partial(noted, "recipes"),
     "frnet": partial(noted, "frnet"),
     "sizes": sizes,
-    "stage-times": partial(stage_times, "guided_net"),
-    "shading-times": partial(stage_times, "shading_warp"),
-    "gate-times": gate_times,
+    "stage-times": stage_times,
+    "shading-times": shading_times,
     "masks": masks,
 }
 

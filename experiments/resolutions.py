@@ -10,6 +10,7 @@ machine that is quiet.
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +48,10 @@ def window_of(scene: str, size: tuple[int, int], frame: int) -> tuple[SceneSeque
     return sequence, window
 
 
-def methods() -> dict[str, Method]:
+def methods(names: Sequence[str]) -> dict[str, Method]:
     """All that can be had: a method without default weights is left out."""
     found = {}
-    for name in METHODS:
+    for name in names:
         try:
             found[name] = jx.load(name)
         except ValueError as error:
@@ -77,6 +78,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--scenes", default="walkers,terrain,dock,street")
     parser.add_argument("--sizes", default=",".join(SIZES))
+    parser.add_argument("--methods", default=",".join(METHODS))
     parser.add_argument("--frame", type=int, default=13, help="odd and at least 5")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--times", action="store_true", help="times only")
@@ -86,7 +88,7 @@ def main() -> None:
         parser.error(f"--sizes: expected some of {','.join(SIZES)}, got {options.sizes}")
     jx.keep_memory()
     content: dict[str, Any] = json.loads(options.output.read_text()) if options.output.exists() else {}
-    known, scenes = methods(), options.scenes.split(",")
+    known, scenes = methods(options.methods.split(",")), options.scenes.split(",")
     for size in options.sizes.split(","):
         here = [window_of(scene, SIZES[size], options.frame) for scene in scenes]
         if not options.times:
@@ -118,7 +120,7 @@ def _times(known: dict[str, Method], here: list[Window], repeats: int) -> dict[s
         for name, method in known.items():
             given = arguments(method, window)
             whole[name].append(measure(lambda m=method, g=given: m.step(m.init(*g[:2]), *g), repeats=repeats).median)
-        for name in BY_STAGE:
+        for name in (name for name in BY_STAGE if name in known):
             for stage, timing in time_stages(known[name], window, repeats=repeats).items():
                 stages.setdefault(name, {}).setdefault(stage, []).append(timing.median)
     means = {name: float(np.mean(values)) for name, values in whole.items()}
@@ -127,7 +129,8 @@ def _times(known: dict[str, Method], here: list[Window], repeats: int) -> dict[s
         for name, found in stages.items()
     }
     print(means, by_stage, flush=True)
-    return {"whole": means, **by_stage, "networks": gates(here[0], repeats)}
+    alone = {"networks": gates(here[0], repeats)} if "guided_net" in known else {}
+    return {"whole": means, **by_stage, **alone}
 
 
 def _print(content: dict[str, Any]) -> None:
@@ -144,7 +147,7 @@ def _print(content: dict[str, Any]) -> None:
                     for name in BY_STAGE
                     for stage, ms in found.get(f"{name}'s stages", {}).items()
                 }
-                by_name = found if kind == "errors" else found["whole"] | stages | found["networks"]
+                by_name = found if kind == "errors" else found["whole"] | stages | found.get("networks", {})
                 for name, entry in by_name.items():
                     rows.setdefault(name, []).append(f"{entry[value] if kind == 'errors' else entry:.2f}")
             for name, cells in rows.items():
