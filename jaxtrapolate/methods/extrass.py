@@ -331,7 +331,7 @@ def refinement_stages(
         mask = jnp.where(values["moves"], blend_mask(light, warped, target, state.settings), 0)
         light = jnp.where(jnp.isfinite(light), light, 0)
         mixed = light * mask + warped.astype(light.dtype) * (1 - mask)
-        return {"image": jnp.where(mask > 0, mixed, warped).astype(warped.dtype)}
+        return {"image": jnp.where(mask > 0, mixed.astype(warped.dtype), warped)}
 
     def unmoved(state, values: Values):
         newer = values["inputs"][0]

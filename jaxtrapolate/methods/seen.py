@@ -93,7 +93,7 @@ def seen_at(history: Frames, target: Frame, place: int) -> tuple[Float[Array, "h
     then, known = _as_it_was(buffers, _moved(history, target, place))
     height, width = then.position.shape[:2]  # type: ignore[union-attr]
     x, y = (jnp.broadcast_to(v, (height, width)) for v in pixel_grid(height, width, matrix.dtype))
-    motion = project(matrix, then.position) - jnp.stack([x, y], -1)
+    motion = project(matrix, then.position.astype(matrix.dtype)) - jnp.stack([x, y], -1)  # type: ignore[union-attr]
     ahead = jnp.all(jnp.isfinite(motion), -1, keepdims=True)
     motion = jnp.where(ahead, motion, 0)
     seen = known & ahead & (misses < MISSES) & ~find_holes(then, replace(source, stencil=None), motion)
