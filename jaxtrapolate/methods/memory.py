@@ -50,8 +50,9 @@ def points_of(buffers: GBuffer, values: Array, known: Array) -> Points:
     """A frame's pixels as points; without positions none."""
     position = cast(Array, buffers.position)
     dtype = widest(values)
-    held = (jnp.zeros_like(position) if a is None else jnp.nan_to_num(a) for a in (position, buffers.normal))
-    return Points(*(a.astype(dtype) for a in (*held, values)), known)
+    normal = jnp.zeros_like(position) if buffers.normal is None else buffers.normal
+    position, normal = (jnp.nan_to_num(a).astype(dtype) for a in (position, normal))
+    return Points(position, normal, values.astype(dtype), known)
 
 
 @record

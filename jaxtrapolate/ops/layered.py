@@ -88,8 +88,9 @@ def margins(size: Size) -> Size:
 def no_points(size: Size, channels: int, dtype: Any) -> HiddenLayer:
     """Nothing has been seen yet, by frames of a size."""
     raster = tuple(n + 2 * more for n, more in zip(size, margins(size), strict=True))
-    zeros = (jnp.zeros((*raster, count), dtype) for count in (3, 3, channels))
-    return HiddenLayer(Points(*zeros, jnp.zeros((*raster, 1), bool)), jnp.zeros((3, 4), dtype))
+    position, normal, values = (jnp.zeros((*raster, count), dtype) for count in (3, 3, channels))
+    points = Points(position, normal, values, jnp.zeros((*raster, 1), bool))
+    return HiddenLayer(points, jnp.zeros((3, 4), dtype))
 
 
 def _limit(position: Array, known: Array) -> Array:
