@@ -331,11 +331,8 @@ MEANS += ("relative_loss", "census_loss", "feature_census_loss", "feature_differ
 MEANS += ("temporal_loss",)
 """One number of all pixels: what is not a number in one of them is seen in it."""
 
-REACHES = {"": 4, "shading_warp": 16, "guided_net": 16}
-"""In pixels, how far what is not a number in one of them may reach; "" is of all cases that are not named.
-
-The flow of light is of windows of 8 x 8 pixels at half size.
-"""
+REACHES = {"": 4}
+"""In pixels, how far what is not a number in one of them may reach; "" is of all cases that are not named."""
 
 
 # Running

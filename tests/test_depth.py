@@ -289,7 +289,7 @@ def test_methods_take_nothing_for_far(name):
     if name == "reproject":  # it shades misses, and has no shader here: the box is right
         np.testing.assert_allclose(images[0][box(4)], truth[box(4)], atol=1e-5)
     else:
-        least = {"softmax_splat": 40, "grid_warp": 21, "grid_extrapolate": 17}.get(name, 60)
+        least = {"softmax_splat": 40, "grid_warp": 25, "grid_extrapolate": 18}.get(name, 60)
         assert jx.psnr(images[0], truth) > least
 
 

@@ -313,7 +313,7 @@ def test_what_tells_of_the_guess_comes_last(direct):
     nnx.update(more, state)
     x, mask, features, history = (jnp.asarray(random(1, *s, seed=k)) for k, s in enumerate(shapes_of(9, 14)))
     told = jnp.concatenate([features, jnp.asarray(random(1, 9, 14, 4, seed=9))], -1)
-    np.testing.assert_allclose(more(x, mask, told, history), plain(x, mask, features, history), atol=5e-6)
+    np.testing.assert_allclose(more(x, mask, told, history), plain(x, mask, features, history), atol=1e-6)
     with pytest.raises(ValueError, match="features: expected shape"):
         more(x, mask, features, history)
 
