@@ -149,13 +149,17 @@ def seen_before_stage(space: Space | None = None) -> Stage:
                     return guided_warp(image, motion, *guide, strides=(1,), keep=how.keep, **sigmas)
 
                 found = in_space(space or how.space, fetch, layer)
-                both = seen & around
+                known = jnp.all(jnp.isfinite(found), -1, keepdims=True)
+                found = jnp.where(known, found, 0)  # so that its gradient with respect to the factor is a number
                 first, then = (image[..., :3] for image in (warped, found))
-                factor = _ratio(first, then, both, jnp.asarray(how.relight)).astype(found.dtype)
+                factor = _ratio(first, then, seen & known & around, jnp.asarray(how.relight)).astype(found.dtype)
                 found = jnp.concatenate([found[..., k : k + 3] * factor for k in range(0, found.shape[-1], 3)], -1)
-                return jnp.where(left & seen, found.astype(warped.dtype), warped)
+                return jnp.where(left & seen & known, found.astype(warped.dtype), warped), known
 
-            warped = jax.lax.cond(jnp.any(left & seen), fill, lambda warped: warped, warped)
+            warped, known = jax.lax.cond(
+                jnp.any(left & seen), fill, lambda warped, left=left: (warped, jnp.ones_like(left)), warped
+            )
+            seen &= known
             age += left.astype(age.dtype)  # once for each frame that is looked at in vain, and for the one that has it
             left = left & ~seen
         memory = values["carry"]
