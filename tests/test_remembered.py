@@ -156,7 +156,7 @@ def test_a_method_fills_holes_by_what_it_remembers():
     def error(image):
         return np.square(np.asarray(jx.tonemap(jnp.asarray(image))) - np.asarray(jx.tonemap(truth)))[holes].mean()
 
-    assert error(image) < 0.02 * error(alone)
+    assert error(image) < 1e-6 * error(alone), "the camera stands: what is remembered is exact, however it is compiled"
     np.testing.assert_array_equal(image[~holes], alone[~holes])
 
 

@@ -16,6 +16,7 @@ from jaxtrapolate.checks import Size
 from jaxtrapolate.ops._hole_parts import cosine, dot, footprint
 from jaxtrapolate.ops.projection import placed
 from jaxtrapolate.ops.scatter import nearest_keys, sources_of
+from jaxtrapolate.ops.strips import once
 from jaxtrapolate.ops.warp import bilinear_taps, take_rows
 from jaxtrapolate.precision import divide
 from jaxtrapolate.records import record
@@ -162,6 +163,8 @@ def from_layer(layer: HiddenLayer, surfaces: Points) -> tuple[Float[Array, "h w 
     height, width = surfaces.known.shape[:2]
     down, across = margins((height, width))
     place, along = placed(layer.matrix, surfaces.position)
+    # made once: what is all but a whole pixel may be rounded to either side of it, by the taps and by their weights
+    place = once(place)
     x, y = place[..., 0] + across, place[..., 1] + down
     points, limit = layer.points, _limit(surfaces.position, surfaces.known)
     rows, columns = points.known.shape[:2]

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from jaxtrapolate.checks import check_array, check_choice, check_image
 from jaxtrapolate.ops.depth import surface_depth
 from jaxtrapolate.ops.scatter import splat_nearest
+from jaxtrapolate.ops.strips import once
 from jaxtrapolate.ops.warp import backward_warp, held_motion, landing, take_rows
 from jaxtrapolate.precision import divide
 from jaxtrapolate.records import Camera, Sign, Units, YAxis, check_camera
@@ -159,7 +160,8 @@ def camera_motion(
     points, previous = carried(jnp.where(finite, position, 0), object_motion, stencil)
     here, ahead = _project(camera, points, height, width)
     there, ahead_before = _project(previous_camera, previous, height, width)
-    return jnp.where(finite & ahead & ahead_before, there - here, jnp.nan)
+    # once: what is all but a whole pixel would be rounded to either side of it by those who read it
+    return once(jnp.where(finite & ahead & ahead_before, there - here, jnp.nan))
 
 
 @jax.jit

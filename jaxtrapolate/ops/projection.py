@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrapolate.checks import check_array, check_image
 from jaxtrapolate.ops.fill import check_mask
+from jaxtrapolate.ops.strips import once
 from jaxtrapolate.ops.warp import pixel_grid
 from jaxtrapolate.precision import divide, widest
 
@@ -111,7 +112,8 @@ def project(matrix: Float[Array, "3 4"], position: Float[Array, "h w 3"]) -> Flo
     check_array("matrix", matrix, shape=(3, 4))
     check_image("position", position, channels=3)
     place, along = placed(matrix, position)
-    return jnp.where(along > 0, place, jnp.nan)
+    # once: what is all but a whole pixel would be rounded to either side of it by those who read it
+    return once(jnp.where(along > 0, place, jnp.nan))
 
 
 def placed(matrix: Float[Array, "3 4"], position: Float[Array, "*n 3"]) -> tuple[Float[Array, "*n 2"], Array]:
