@@ -126,6 +126,16 @@ def test_around_a_contradiction_next_to_nothing_is_believed():
         np.testing.assert_allclose(held[~near], 0.52, rtol=1e-5)
 
 
+def test_light_on_what_is_dark_is_no_contradiction():
+    """Divided by next to no albedo it is bright, but not shown so; what is shown says where a lamp is."""
+    first = jnp.full((9, 11, 1), 0.5)
+    inputs, correction = (first, first.at[4, 5].set(6.0)), jnp.full((9, 11, 1), 9.0)
+    held = explained(correction, inputs, shown=(first, first.at[4, 5].set(0.6)))
+    np.testing.assert_allclose(held[3:6, 4:7], 9.0, rtol=1e-6)
+    np.testing.assert_array_equal(explained(correction, inputs, shown=inputs), explained(correction, inputs))
+    np.testing.assert_allclose(explained(correction, inputs)[3:6, 4:7], TOLERANCE, rtol=1e-5)
+
+
 @pytest.mark.parametrize("lamp", [1.0, *slow(100.0), 3e4])
 @pytest.mark.parametrize("name", ["guided_warp", *slow("guided_net")])
 def test_beside_a_lamp_the_wall_is_as_it_was(name, lamp):

@@ -83,6 +83,9 @@ def test_led_by_a_flow(models):
     np.testing.assert_allclose(function(state, newer, older, roughness, lead).flow, trusted + flow, atol=1e-6)
     with pytest.raises(ValueError, match="lead"):
         function(state, newer, older, roughness)
+    function, state = inference(models[FLOW])
+    with pytest.raises(ValueError, match="lead: expected None, as this network's configuration is not led"):
+        function(state, newer, older, roughness, lead)
 
 
 def test_merged_by_hand(models):

@@ -10,13 +10,14 @@ from flax import nnx
 from small_extranet import make_window, random_model
 
 import jaxtrapolate as jx
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.evaluation.windows import Window
 from jaxtrapolate.methods.extrass import Refinement
 from jaxtrapolate.networks import FRNet, FRNetConfig
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.records import replace
 from jaxtrapolate.training import Config, Optimizer, load_config, train_and_evaluate
-from jaxtrapolate.training.config import parse_config
+from jaxtrapolate.training.config import make_task, parse_config
 from jaxtrapolate.training.extrass_losses import census_loss, feature_census_loss
 from jaxtrapolate.training.frnet import FRNetOptions, FRNetTask
 from jaxtrapolate.training.windows import WindowOptions
@@ -103,6 +104,9 @@ def test_configuration_and_errors():
         parse_config({"task": "extrass_refine", "steps": 1, "options": {"crop": [97, 20]}})
     with pytest.raises(ValueError, match=r"options\.feature_weight: expected at least 0"):
         parse_config({"task": "extrass_refine", "steps": 1, "options": {"feature_weight": -1.0}})
+    with pytest.raises(InputError, match='options: taken: "flow" is of a network that moves the newer frame alone'):
+        make_task(parse_config({"task": "extrass_refine", "steps": 1, "options": {
+            "network": {"merge": True}, "preparation": {"taken": "flow"}}}))  # fmt: skip
     with pytest.raises(ValueError, match='crops: "error" is of the loss "blend"'):
         parse_config({"task": "extrass_refine", "steps": 1, "options": {"crops": "error"}})
     assert load_config("extrass_refine_blend").options.preparation.changed == 0

@@ -321,13 +321,12 @@ def refinement_stages(
 
     def blend(state, values: Values):
         target, warped = values["target"].gbuffer, values["image"]
-        divided = not preparation.modulated and have_albedo(target, *(s.gbuffer for s in values["sources"]))
-        own = preparation.encode(values["warped"] if divided else warped)
+        divisor = None if preparation.modulated else values["divisor"]
+        own = preparation.encode(warped if divisor is None else values["warped"])
         answer = values["inputs"][0], values["refined"], values["refined_flow"]
         light = preparation.decode(taken(preparation, own, *answer))
-        if divided:
-            buffers = reflecting(target, preparation.sky)
-            light = modulate(light, buffers, by=preparation.by, floor=preparation.floor)
+        if divisor is not None:
+            light = light * divisor.astype(light.dtype)
         mask = jnp.where(values["moves"], blend_mask(light, warped, target, state.settings), 0)
         light = jnp.where(jnp.isfinite(light), light, 0)
         mixed = light * mask + warped.astype(light.dtype) * (1 - mask)
@@ -339,7 +338,7 @@ def refinement_stages(
         return {"refined": newer, "refined_flow": flow, "moves": jnp.zeros((), bool)}
 
     given = ("refined", "refined_flow", "moves")
-    blended = ("image", "warped", "inputs", *given, "sources", "target")
+    blended = ("image", "warped", "divisor?", "inputs", *given, "target")
     still = Needed("light moves", lambda state, values: jnp.any(values["inputs"][0] != values["inputs"][1]), unmoved)
     moved = light_stages(preparation.space)[:-1] if config.led else ()  # FRNet moves it
     return (

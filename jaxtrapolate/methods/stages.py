@@ -4,8 +4,8 @@ Values they pass on: "sources", the rendered frames that are warped, newest firs
 each of them; "newest" and "motion", the first of both. "masks", bool, for each source where it shows something else,
 and "holes", the first of them. "plain_share", where the undivided colour should be preferred, from
 `jaxtrapolate.methods.hindsight`. "layers", for each source the image that is to be warped: its colour, or where that
-can be the demodulated colour, followed by the undivided one where "plain_share" asks for both. "occlusion_motion".
-"warped", the layers warped to the target, and "image".
+can be the demodulated colour, followed by the undivided one where "plain_share" asks for both; "divisor", what the
+target's is to be multiplied by again. "occlusion_motion". "warped", the layers warped to the target, and "image".
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from jaxtrapolate.methods.space import Space, in_space, space
 from jaxtrapolate.methods.stage import Needed, Stage, Values
 from jaxtrapolate.ops.holes import Taps, hole_masks
 from jaxtrapolate.ops.motion import chain_motion, occlusion_motion
-from jaxtrapolate.ops.radiance import By, demodulate, modulate
+from jaxtrapolate.ops.radiance import By, demodulate, demodulation_divisor
 from jaxtrapolate.ops.warp import backward_warp
 from jaxtrapolate.records import Frame, GBuffer, replace
 
@@ -113,9 +113,12 @@ def demodulate_stage(how: Any = None) -> Stage:
             irradiance = demodulate(source.color, buffers, by=given.by, floor=given.floor)
             both = values["plain_share"] is not None
             layers.append(jnp.concatenate([irradiance, source.color], -1) if both else irradiance)
-        return {"layers": tuple(layers)}
+        target = reflecting(values["target"].gbuffer, given.sky)
+        divisor = demodulation_divisor(target, by=given.by, floor=given.floor)
+        return {"layers": tuple(layers), "divisor": divisor}
 
-    return Stage("demodulate", function, ("sources", "plain_share?"), ("layers",), **_REFLECTANCE)
+    takes = ("sources", "target", "plain_share?")
+    return Stage("demodulate", function, takes, ("layers", "divisor"), **_REFLECTANCE)
 
 
 def modulate_stage(how: Any = None) -> Stage:
@@ -127,9 +130,8 @@ def modulate_stage(how: Any = None) -> Stage:
     """
 
     def function(state, values: Values):
-        given = how or state.settings
-        buffers = reflecting(values["target"].gbuffer, given.sky)
-        image = modulate(values["warped"][..., :3], buffers, by=given.by, floor=given.floor)
+        given, warped = how or state.settings, values["warped"][..., :3]
+        image = warped * values["divisor"].astype(warped.dtype)
         share = values["plain_share"]
         if share is not None:
             own = values["warped"][..., 3:]
@@ -138,7 +140,7 @@ def modulate_stage(how: Any = None) -> Stage:
             image = blend(image, plain, share)
         return {"image": image}
 
-    takes = ("warped", "target", "plain_share?", "newest", "motion", "holes")
+    takes = ("warped", "divisor", "plain_share?", "newest", "motion", "holes")
     return Stage("modulate", function, takes, ("image",), **_REFLECTANCE)
 
 

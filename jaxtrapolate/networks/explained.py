@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 GAIN = 2.0
@@ -23,10 +24,17 @@ def _widened(image: Float[Array, "h w 1"], reach: int = 1) -> Float[Array, "h w 
     return jax.lax.reduce_window(image, -jnp.inf, jax.lax.max, (size, size, 1), (1, 1, 1), "SAME")
 
 
+def _spread(images: Sequence[Float[Array, "h w c"]], dtype: DTypeLike) -> Float[Array, "h w 1"]:
+    """By how much they differ at most."""
+    stacked = jnp.stack([image.astype(dtype) for image in images])
+    return jnp.max(jnp.max(stacked, 0) - jnp.min(stacked, 0), -1, keepdims=True)
+
+
 def explained(
     correction: Float[Array, "h w c"],
     inputs: Sequence[Float[Array, "h w c"]],
     *,
+    shown: Sequence[Float[Array, "h w c"]] | None = None,
     free: Bool[Array, "h w 1"] | None = None,
 ) -> Float[Array, "h w c"]:
     """A network's correction, held within what its inputs differ by around a pixel.
@@ -34,19 +42,21 @@ def explained(
     At most `GAIN` times the largest difference between two inputs among a pixel and its eight neighbours, plus
     `TOLERANCE`: where shading moves, the inputs differ, and where they agree there is nothing to correct. Up to 4
     pixels from a difference of `CONTRADICTED` less, and of twice that `TOLERANCE` alone: no shading differs so much,
-    one of the inputs shows a lamp where another does not, and the answer rings around it.
+    one of the inputs shows a lamp where another does not, and the answer rings around it. That is asked of what is
+    `shown`: light that was divided by next to no reflectance is bright, and still no lamp.
 
     Args:
         correction: what is added to a first guess, in the domain of the inputs: logarithms, or display values.
         inputs: images of what the network was shown, all on the target's grid; finite.
+        shown: the inputs as they would be displayed, modulated; the inputs themselves by default.
         free: where it is not held: holes, of which the inputs show nothing.
 
     Gradient:
         With respect to the correction where it is not held, and with respect to the inputs where it is.
     """
-    stacked = jnp.stack([image.astype(correction.dtype) for image in inputs])
-    spread = jnp.max(jnp.max(stacked, 0) - jnp.min(stacked, 0), -1, keepdims=True)
-    believed = jnp.clip(2 - _widened(spread, _RINGS) / CONTRADICTED, 0, 1)
+    spread = _spread(inputs, correction.dtype)
+    contradiction = spread if shown is None else _spread(shown, correction.dtype)
+    believed = jnp.clip(2 - _widened(contradiction, _RINGS) / CONTRADICTED, 0, 1)
     limit = GAIN * _widened(spread) * believed + TOLERANCE
     held = jnp.where(correction > limit, limit, jnp.where(correction < -limit, -limit, correction))
     return held if free is None else jnp.where(free, correction, held)

@@ -118,6 +118,8 @@ class FRNet(nnx.Module):
     def _leads(self, lead: Array | None, size: tuple[int, int, int]) -> list[Array]:
         """The flow that is trusted and the trust in it, at each level, the finest first; none without."""
         if not self.config.led:
+            if lead is not None:
+                raise ValueError("lead: expected None, as this network's configuration is not led")
             return []
         lead = check_present("lead", lead, needed_by="this network")
         check_array("lead", lead, shape=(*size, 3))
@@ -157,7 +159,7 @@ class FRNet(nnx.Module):
             is that of its edge.
 
         Raises:
-            TypeError, ValueError: as `features`, or frames whose shapes differ.
+            TypeError, ValueError: as `features`, frames whose shapes differ, or a `lead` for a network that is not led.
         """
         batch, height, width, _ = check_array("newer", newer, shape=("B", "H", "W", 3))
         check_array("older", older, shape=(batch, height, width, 3))

@@ -209,5 +209,12 @@ def _shipped() -> dict[str, Any]:
 
 
 def make_task(config: Config) -> Task:
-    """The task of a configuration."""
-    return find_task(config.task).make(config.options)
+    """The task of a configuration.
+
+    Raises:
+        InputError: options that do not go together, or name what cannot be read.
+    """
+    try:
+        return find_task(config.task).make(config.options)
+    except ValueError as error:
+        raise InputError(f"options: {error}") from error

@@ -11,9 +11,9 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxtrapolate.checks import Size, check_choice, missing_package
+from jaxtrapolate.checks import Size, check_choice, check_present, missing_package
 from jaxtrapolate.evaluation.windows import hide
-from jaxtrapolate.methods.extrass import Refinement, read_refine
+from jaxtrapolate.methods.extrass import REFINE_NAME, Refinement, read_refine
 from jaxtrapolate.methods.extrass_joint import NAME, extrass, extrass_config
 from jaxtrapolate.methods.supersampling import upsampled_motion
 from jaxtrapolate.metrics.image import psnr
@@ -37,9 +37,9 @@ from jaxtrapolate.training.extrass_losses import (
 from jaxtrapolate.training.losses import hole_loss, l1_loss
 from jaxtrapolate.training.tasks import Batch, Example
 from jaxtrapolate.training.windows import MOVING, SEEDS, VALIDATION_SEEDS, check_crop
+from jaxtrapolate.weights import default_weights
 
 _TIMES = (0.0, 120.0)  # of a scene
-_NUMBERS = range(-3, 1)  # of the frames of an example, the last one the target
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,8 +48,8 @@ class ExtraSSOptions:
 
     Attributes:
         sampler: the size of the network.
-        refinement: a file of weights of "extrass_refine", whose FRNet and preparation are used; empty: a new FRNet,
-            which moves next to nothing.
+        refinement: a file of weights of "extrass_refine", or "default", whose FRNet and preparation are used; empty: a
+            new FRNet, which moves next to nothing.
         size: `(H, W)` of the low-resolution frames.
         scenes: their names.
         step: frames' least and largest distance in a scene's own time, uniform between.
@@ -115,11 +115,14 @@ class ExtraSSTask:
         self._frnet: FRNet | None = None
         self._preparation, refining = Refinement(), FRNetConfig()
         if options.refinement:
-            self._frnet, self._preparation = read_refine(options.refinement)
+            given = options.refinement
+            self._frnet, self._preparation = read_refine(default_weights(REFINE_NAME) if given == "default" else given)
             refining = self._frnet.config
         self._config = ExtraSSConfig(refining, options.sampler)
         self._stages = extrass(self.init(nnx.Rngs(0)), preparation=self._preparation)
-        self._examples = jax.jit(self._example)
+        self._numbers = range(1 - 2 * self._stages.past, 1)  # of the frames of an example, the last one the target
+        # scenes are compiled each, what is made of their frames once
+        self._draw, self._prepared = jax.jit(self._drawing), jax.jit(self._prepare)
         self._held: list[Example] = []
         deep = options.perceptual == "vgg" and missing_package("lpips") is None
         self._perceptual = perceptual_loss if deep else slope_loss
@@ -134,30 +137,37 @@ class ExtraSSTask:
             nnx.update(model.frnet, nnx.state(self._frnet))
         return model
 
-    def _example(self, world: Scene, time: Array, step: Array, jitters: Float[Array, "4 2"]) -> Example:
-        """What is prepared of one place in a scene."""
-        options, scale = self.options, self.options.sampler.scale
-        height, width = options.size
+    def _drawing(
+        self, world: Scene, time: Array, step: Array, jitters: Float[Array, "n 2"]
+    ) -> tuple[Frame, Float[Array, "two i j 3"]]:
+        """The frames of one place in a scene, stacked, and what the last two of them show, as larger ones."""
+        options = self.options
+        larger = (options.sampler.scale * options.size[0], options.sampler.scale * options.size[1])
 
         def draw(number: Array, jitter: Array) -> Frame:
             now = time + number * step
             return render(world, now, size=options.size, jitter=jitter, previous_time=now - step)
 
-        stacked = jax.lax.map(lambda pair: draw(*pair), (jnp.array(_NUMBERS, jnp.float32), jitters))
-        oldest, between, before, target = (jax.tree.map(lambda leaf, k=k: leaf[k], stacked) for k in range(4))
-        larger = (scale * height, scale * width)
-
         def truth(number: Array) -> Array:
             frame = render(world, time + number * step, size=larger, samples=options.samples)
-            return pixel_unshuffle(self._preparation.encode(jnp.asarray(frame.color))[None], scale)[0]
+            return jnp.asarray(check_present("color", frame.color, needed_by="training"))
 
-        method, history = self._stages, (oldest, hide(between))
+        frames = jax.lax.map(lambda pair: draw(*pair), (jnp.array(self._numbers, jnp.float32), jitters))
+        return frames, jax.lax.map(truth, jnp.array([-1, 0], jnp.float32))
+
+    def _prepare(self, frames: Frame, truths: Float[Array, "two i j 3"]) -> Example:
+        """What the network is shown of them."""
+        scale, (height, width) = self.options.sampler.scale, self.options.size
+        *seen, target = (jax.tree.map(lambda leaf, k=k: leaf[k], frames) for k in range(len(self._numbers)))
+        *history, before = (hide(frame) if k % 2 else frame for k, frame in enumerate(seen))  # every other one rendered
+        method, history = self._stages, tuple(history)
         carry = method.init(history, before)
         at = functools.partial(method.values_before, "super sampling", method.state, carry)
         first, extrapolated = at(history, before), at((*history, before), hide(target))
         rendered = at((*history, before), target)
         refined, _, depth, _, guided, albedo = extrapolated["sampled"]
         motion = upsampled_motion(extrapolated["history"], extrapolated["target"], scale)
+        jitters = jnp.concatenate([jnp.asarray(frame.jitter) for frame in (before, target)])
         return {
             "before": first["sampled"][0],
             "color": rendered["sampled"][0],
@@ -165,10 +175,10 @@ class ExtraSSTask:
             "guided": guided,
             "albedo": albedo,
             "depths": jnp.concatenate([first["sampled"][2], depth], -1),
-            "jitters": jnp.broadcast_to(jitters[2:].reshape(-1), (height, width, 4)),
+            "jitters": jnp.broadcast_to(jitters, (height, width, 4)),
             "motion": pixel_unshuffle(motion[None], scale)[0],
             "holes": extrapolated["holes"].astype(depth.dtype),
-            "truths": jnp.concatenate([*jax.lax.map(truth, jnp.array([-1, 0], jnp.float32))], -1),
+            "truths": jnp.concatenate([*pixel_unshuffle(self._preparation.encode(truths), scale)], -1),
         }
 
     def _drawn(self, words: list[int], number: int, seeds: range) -> Example:
@@ -176,8 +186,8 @@ class ExtraSSTask:
         world = scene(options.scenes[rng.integers(len(options.scenes))], seeds[int(rng.integers(len(seeds)))])
         time, step = (np.float32(rng.uniform(*bounds)) for bounds in (_TIMES, options.step))
         begun = int(rng.integers(16))
-        jitters = np.stack([jitter_of(begun + k) for k in range(len(_NUMBERS))]).astype(np.float32)
-        return self._examples(world, jnp.asarray(time), jnp.asarray(step), jnp.asarray(jitters))
+        jitters = np.stack([jitter_of(begun + k) for k in range(len(self._numbers))]).astype(np.float32)
+        return self._prepared(*self._draw(world, jnp.asarray(time), jnp.asarray(step), jnp.asarray(jitters)))
 
     def pool(self, key: PRNGKeyArray, numbers: range) -> Example:
         """Prepared places in the scenes' training seeds."""

@@ -12,6 +12,7 @@ from flax import nnx
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float, Int
 
+from jaxtrapolate.errors import InputError
 from jaxtrapolate.records import record, replace
 from jaxtrapolate.training import devices
 from jaxtrapolate.training.config import Config, Optimizer
@@ -127,6 +128,9 @@ def make_step(task: Task, config: Config) -> Step:
     The pool is divided along its leading axis, and so is the batch: slot b of every batch holds examples of the b-th
     part of the pool, so that no example ever moves from one device to another, and the same examples are drawn on any
     number of devices.
+
+    Raises:
+        InputError: `frozen` names what the network has not.
     """
     optimizer = transformation(config.optimizer, config.steps)
     rate = schedule(config.optimizer, config.steps)
@@ -140,15 +144,15 @@ def make_step(task: Task, config: Config) -> Step:
         """A tree like the weights with zeros for the parts that are frozen."""
         if not config.frozen:
             return tree
-        if unknown := set(config.frozen) - set(tree):
-            raise ValueError(f"frozen: the network has no {', '.join(sorted(unknown))}; it has {', '.join(tree)}")
 
         def kept(path: Any, leaf: Array) -> Array:
             return jnp.zeros_like(leaf) if path[0].key in config.frozen else leaf
 
         return jax.tree_util.tree_map_with_path(kept, tree)
 
-    graph, evaluated = (nnx.eval_shape(lambda t=training: split(t))[0] for training in (True, False))
+    (graph, parts), (evaluated, _) = (nnx.eval_shape(lambda t=training: split(t)[:2]) for training in (True, False))
+    if unknown := set(config.frozen) - set(parts):
+        raise InputError(f"frozen: the network has no {', '.join(sorted(unknown))}; it has {', '.join(parts)}")
 
     def create() -> State:
         _, weights, statistics, rest = split(True)
