@@ -1,6 +1,6 @@
 """Makes the pictures of the pages: what an operation does, a wrong convention of motion, the scenes, the demo.
 
-python docs/pictures.py --operations --convention --scenes
+python docs/pictures.py --operations --convention --scenes --wrong
 jaxtrapolate demo && python docs/pictures.py --demo demo   # or, for the same picture in less time:
 jaxtrapolate evaluate scenes:demo --size 480x270 --length 16 --methods warp,guided_warp,guided_net --output demo
 """
@@ -23,9 +23,10 @@ from jaxtrapolate.bidirectional.assisted import CASES
 from jaxtrapolate.checks import check_present
 from jaxtrapolate.evaluation.pictures import buffer_picture, eight_bit, motion_picture
 from jaxtrapolate.evaluation.score import display
+from jaxtrapolate.evaluation.windows import arguments, windows
 from jaxtrapolate.methods.stages import find_holes
 from jaxtrapolate.report import CAUSE_COLORS, ERROR_LIMIT, colorize_error
-from jaxtrapolate.scenes import SceneSequence, scene_names
+from jaxtrapolate.scenes import DEVELOPMENT_SEEDS, SceneSequence, scene_names
 
 HERE = Path(__file__).parent
 FONT = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
@@ -314,6 +315,35 @@ def convention_picture() -> Image.Image:
     return stacked(whole, error_scale(whole.width))
 
 
+_WRONG = {
+    "walkers": "two casters' light",
+    "street": "a lamp comes into view",
+    "forest": "seen by no frame",
+    "windmill": "a shadow turns",
+}
+"""Scenes, and what is wrong where `shading_warp` errs most."""
+
+
+def wrong_picture() -> Image.Image:
+    """Of four scenes the window in which `shading_warp` errs most: by method, and the error of each."""
+    names = ("guided_warp", "shading_warp", "guided_net")
+    tiles = []
+    for name, text in _WRONG.items():
+        sequence = SceneSequence(name, DEVELOPMENT_SEEDS[0], frames=10, size=SIZE)
+        (window,) = windows(sequence, [9], past=3)
+        made = {n: jx.load(n)(*arguments(jx.load(n), window)) for n in names}
+        truth = window.truth.color
+        missed = np.square(display(made["shading_warp"], hdr=True) - display(truth, hdr=True)).sum(-1)
+        part = most(np.asarray(missed), (45, 80))
+        tiles.append(labelled(shown(truth)[part], f"{name}: {text}", scale=3))
+        texts = {n: f"{n}: {decibels(i[part], truth[part])} here" for n, i in made.items()}
+        tiles += [labelled(shown(i)[part], texts[n], scale=3) for n, i in made.items()]
+        tiles.append(labelled(boxed(shown(truth), part), "where").resize((240, 158), Image.Resampling.LANCZOS))
+        tiles += [labelled(off(i, truth)[part], "its error", scale=3) for i in made.values()]
+    whole = sheet(tiles, 4)
+    return stacked(whole, error_scale(whole.width))
+
+
 def demo_strip(folder: Path) -> Image.Image:
     """Input, result, error and a close-up of the frame that the demo found hardest."""
     results = json.loads((folder / "results.json").read_text())
@@ -378,6 +408,7 @@ def main() -> None:
     parser.add_argument("--scenes", action="store_true", help="scenes.jpg")
     parser.add_argument("--operations", nargs="*", choices=OPERATIONS, help="operations/*.jpg, or those named")
     parser.add_argument("--convention", action="store_true", help="convention.jpg")
+    parser.add_argument("--wrong", action="store_true", help="wrong.jpg: what is still wrong with light that moves")
     options = parser.parse_args()
     made = {}
     if options.demo:
@@ -386,6 +417,8 @@ def main() -> None:
         made["scenes"] = contact_sheet()
     if options.convention:
         made["convention"] = convention_picture()
+    if options.wrong:
+        made["wrong"] = wrong_picture()
     if options.operations is not None:
         (HERE / "operations").mkdir(exist_ok=True)
         made |= {f"operations/{name}": OPERATIONS[name]() for name in options.operations or OPERATIONS}

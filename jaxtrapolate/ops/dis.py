@@ -1,6 +1,7 @@
 """Dense optical flow by inverse search of patches (Kroeger et al. 2016, "DIS")."""
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Literal, NamedTuple, get_args
 
@@ -58,27 +59,27 @@ def enlarged(flow: Complex[Array, "h w"], size: Size) -> Complex[Array, "i j"]:
     return jax.lax.complex(resize(jnp.real(flow), size) * across, resize(jnp.imag(flow), size) * down)
 
 
-def like(a: Array, b: Array, sigma: Array) -> Array:
-    """How much pixels with two guides `[G, ...]` count for each other."""
-    return jnp.exp(-0.5 * jnp.sum(jnp.square((a - b) / sigma), 0))
+def like(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    """How much pixels with two guides count for each other, channel by channel, in units of their sigma."""
+    # terms that are added are one loop; XLA on a CPU makes a sum over an axis of few one of its own
+    return jnp.exp(-0.5 * sum(jnp.square(one - other) for one, other in zip(a, b, strict=True)))
 
 
 class Guidance(NamedTuple):
-    """What windows are weighted with: guides `[G, H, W]`, in what unit they differ, and where there is an image."""
+    """What windows are weighted with: guides `[G, H, W]` in units of their sigma, and where there is an image."""
 
     guide: Float[Array, "g h w"]
-    sigma: Float[Array, ""]
     valid: Float[Array, "h w"]
 
     def resized(self, size: Size) -> "Guidance":
         """At a smaller size: means of what a pixel covers."""
         guide = jnp.stack([resize(a, size, kind="area") for a in self.guide])
-        return Guidance(guide, self.sigma, resize(self.valid, size, kind="area"))
+        return Guidance(guide, resize(self.valid, size, kind="area"))
 
     def of_patches(self, stride: int) -> Float[Array, "8 8 n"]:
         """Of the patches' pixels: valid, and like the patch's middle."""
-        taps, middle = (jax.vmap(partial(f, stride=stride))(self.guide) for f in (cut, centres))
-        return like(taps, middle[:, None, None], self.sigma) * cut(self.valid, stride)
+        taps, middles = ([f(image, stride) for image in self.guide] for f in (cut, centres))
+        return like(taps, middles) * cut(self.valid, stride)
 
     def of_neighbours(self) -> Weights:
         """Of pixels, valid, and of each for the next to the right and below, which it is like."""
@@ -86,7 +87,7 @@ class Guidance(NamedTuple):
         def beside(axis):
             size = self.guide.shape[axis]
             after = jnp.take(self.guide, jnp.minimum(jnp.arange(1, size + 1), size - 1), axis)
-            return once(like(self.guide, after, self.sigma))
+            return once(like(tuple(self.guide), tuple(after)))
 
         return Weights(self.valid, beside(2), beside(1))
 

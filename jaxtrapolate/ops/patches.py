@@ -95,23 +95,36 @@ def gradient(image: Float[Array, "h w"], axis: int) -> Float[Array, "h w"]:
     return (after - before) * 0.5
 
 
+def _sums(terms, *given):
+    """Sums over the pixels of each patch, of the terms that a function makes of them; row by row, as they lie."""
+
+    def pixel(arrays, i):
+        return (None if a is None else a[i] for a in arrays)
+
+    def row(sums, arrays):
+        for i in range(PATCH):
+            sums = [a + b for a, b in zip(sums, terms(*pixel(arrays, i)), strict=True)]
+        return sums, None
+
+    zero = [jnp.zeros_like(a) for a in terms(*pixel([None if a is None else a[0] for a in given], 0))]
+    return jax.lax.scan(row, zero, given)[0]
+
+
 def patches(first: Float[Array, "h w"], stride: int, weight: Float[Array, "8 8 n"] | None) -> Patches:
     """All patches of the first image; `weight` is of their pixels."""
 
-    def total(a):
-        return jnp.sum(a if weight is None else a * weight, (0, 1))
+    def weighed(a, weight):
+        return a if weight is None else a * weight
 
     images = jnp.stack([first, *(gradient(first, axis) for axis in (1, 0))])
     grey, x, y = jax.vmap(partial(cut, stride=stride))(images)
-    count = total(jnp.ones_like(grey))
-    x, y = (a - divide(total(a), count)[None, None] for a in (x, y))
-    xx, xy, yy = total(x * x), total(x * y), total(y * y)
+    count, *totals = _sums(lambda x, y, w: [weighed(a, w) for a in (jnp.ones_like(x), x, y)], x, y, weight)
+    x, y = (a - divide(total, count)[None, None] for a, total in zip((x, y), totals, strict=True))
+    xx, xy, yy = _sums(lambda x, y, w: [weighed(a, w) * b for a, b in ((x, x), (x, y), (y, y))], x, y, weight)
     more = _DAMPING * (xx + yy) + _FLAT
     xx, yy = xx + more, yy + more
     over = 1 / (xx * yy - xy * xy)
-    if weight is not None:
-        x, y = x * weight, y * weight
-    return Patches(grey, x, y, weight, count, (yy * over, -xy * over, xx * over))
+    return Patches(grey, weighed(x, weight), weighed(y, weight), weight, count, (yy * over, -xy * over, xx * over))
 
 
 class Second(NamedTuple):
@@ -149,6 +162,7 @@ def _fetch(second: Second, x, y):
     taps = jax.lax.map(
         lambda offset: take_rows(second.pixels, jnp.minimum(index + offset, last))[..., 0],
         jnp.asarray(offsets, jnp.int32),
+        batch_size=PATCH + 1,
     )
     return taps.reshape(PATCH + 1, PATCH + 1, -1), x - left, y - top
 

@@ -21,6 +21,7 @@ from jaxtrapolate.ops.warp import pixel_grid
 from jaxtrapolate.precision import divide, widest
 
 _STRIDE, _STEPS, _REFINEMENTS = 3, 3, 2  # of the inverse search: those of the preset "medium"
+_ROWS = 180  # of the working resolution; with 360 a frame of 720 rows takes three times as long
 _SOFT = 0.1  # of the gain: from none of the confidence to all of it
 _UNLIKE = 1e-4  # what a pixel counts at least that is unlike, where no other is left
 
@@ -46,20 +47,16 @@ def _guided_enlarged(values, guidance: Guidance, guide):
     for old, new in zip(values.shape[1:], size, strict=True):
         at = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
         lower.append(np.minimum(at.astype(int), max(old - 2, 0)))
-        further.append(at - lower[-1])
-    both = jnp.concatenate([values, guidance.guide])
-    total, count = jnp.zeros((len(values), *size), values.dtype), jnp.zeros(size, values.dtype)
-    for j in (0, 1):
-        for i in (0, 1):
-            rows, columns = (
-                np.minimum(low + k, old - 1) for low, k, old in zip(lower, (j, i), values.shape[1:], strict=True)
-            )
-            taken = jnp.take(jnp.take(both, rows, 1), columns, 2)
-            share = np.outer(*(f if k else 1 - f for f, k in zip(further, (j, i), strict=True)))
-            weight = like(taken[len(values) :], guide, guidance.sigma) + _UNLIKE
-            weight = weight * jnp.asarray(share, values.dtype)
-            total, count = total + weight[None] * taken[: len(values)], count + weight
-    return total / count[None]
+        further.append(np.asarray(at - lower[-1], values.dtype))
+    # columns first, where there are fewer rows; values and guides apart, so that each is fetched where it is used
+    indices = [[np.minimum(low + k, old - 1) for k in (0, 1)] for low, old in zip(lower, values.shape[1:], strict=True)]
+    images = once([[jnp.take(a, beside, 2) for a in (values, guidance.guide)] for beside in indices[1]])
+    places = [(j, i) for j in (0, 1) for i in (0, 1)]
+    shares = [np.outer(*(f if k else 1 - f for f, k in zip(further, place, strict=True))) for place in places]
+    alike = [like(tuple(jnp.take(images[i][1], indices[0][j], 1)), tuple(guide)) for j, i in places]
+    weights = once([(weight + _UNLIKE) * share for weight, share in zip(alike, shares, strict=True)])
+    parts = [w * jnp.take(images[i][0], indices[0][j], 1) for w, (j, i) in zip(weights, places, strict=True)]
+    return sum(parts[1:], parts[0]) / sum(weights[1:], weights[0])
 
 
 def _confidence(newer, older, flow, guidance: Guidance, options):
@@ -100,10 +97,10 @@ def _shading_flow(
     if guide is not None:
         known = jnp.isfinite(guide)
         valid &= jnp.all(known, -1)
-        guide = jnp.where(known, guide, 0).astype(wide)
-    guides = jnp.zeros((1, *size), wide) if guide is None else jnp.moveaxis(guide, -1, 0)
-    sigma, least_gain, least_change = (jnp.asarray(a, wide) for a in (sigma_guide, least_gain, least_change))
-    guidance = Guidance(guides, sigma, valid.astype(wide))
+        guide = jnp.where(known, guide, 0).astype(wide) / jnp.asarray(sigma_guide, wide)
+    guides = jnp.zeros((1, *size), wide) if guide is None else once(jnp.moveaxis(guide, -1, 0))
+    least_gain, least_change = (jnp.asarray(a, wide) for a in (least_gain, least_change))
+    guidance = Guidance(guides, valid.astype(wide))
 
     def gray(image):
         held = jnp.clip(jnp.where(valid[..., None], image, 0).astype(wide), -BRIGHTEST, BRIGHTEST)
@@ -126,7 +123,7 @@ def _shading_flow(
     else:
         scale = [new / old for new, old in zip(size, small, strict=True)]
         parts = jnp.stack([jnp.real(flow) * scale[1], jnp.imag(flow) * scale[0], confidence])
-        parts = _guided_enlarged(parts, level, guides)
+        parts = once(_guided_enlarged(parts, level, guides))
     confidence = jnp.where(valid, parts[2], 0)
     flow = jnp.where((confidence > 0)[..., None], jnp.stack([parts[0], parts[1]], -1), 0)
     return flow.astype(newer.dtype), confidence[..., None].astype(newer.dtype)
@@ -139,7 +136,7 @@ def shading_flow(
     guide: Float[ArrayLike, "h w g"] | None = None,
     valid: Bool[ArrayLike, "h w"] | None = None,
     sigma_guide: float | Float[ArrayLike, ""] = 0.2,
-    finest: int = 1,
+    finest: int | None = None,
     reach: int = 4,
     least_gain: float | Float[ArrayLike, ""] = 0.3,
     least_change: float | Float[ArrayLike, ""] = 3e-5,
@@ -162,7 +159,7 @@ def shading_flow(
         valid: bool `[H, W]`, False in holes of either image, which have no weight. `None`: all are.
         sigma_guide: guides that differ by this count exp(-1/2) for each other.
         finest: the working resolution: the flow is found at 1 / 2^finest of the size (0: at the size itself), and
-            enlarged from pixels with like guides.
+            enlarged from pixels with like guides. `None`: at half the size, or less as long as 180 rows are left.
         reach: how many pixels of the working resolution what changed is averaged over.
         least_gain: share of the squared change, 0..1, that the flow must explain; all of the confidence is there
             from 0.1 more on.
@@ -201,8 +198,9 @@ def shading_flow(
         check_image("guide", guide, size=size)
     if valid is not None:
         check_mask("valid", valid, size=size)
-    for name, value, least in (("finest", finest, 0), ("reach", reach, 0)):
-        if value < least:
-            raise ValueError(f"{name}: expected {least} or more, got {value!r}")
+    finest = max(1, int(np.log2(min(size) / _ROWS))) if finest is None else finest
+    for name, value in (("finest", finest), ("reach", reach)):
+        if value < 0:
+            raise ValueError(f"{name}: expected 0 or more, got {value!r}")
     numbers = sigma_guide, least_gain, least_change, round_trip
     return _shading_flow(newer, older, guide, valid, *numbers, finest=finest, reach=reach)

@@ -16,6 +16,7 @@ from jaxtrapolate.evaluation.windows import hide
 from jaxtrapolate.methods.extrass import REFINE_NAME, Refinement, read_refine
 from jaxtrapolate.methods.extrass_joint import NAME, extrass, extrass_config
 from jaxtrapolate.methods.supersampling import upsampled_motion
+from jaxtrapolate.methods.upsampling import taau
 from jaxtrapolate.metrics.image import psnr
 from jaxtrapolate.networks.blocks import pixel_shuffle, pixel_unshuffle
 from jaxtrapolate.networks.extrass import ExtraSS, ExtraSSConfig, ExtraSSNetConfig
@@ -53,12 +54,17 @@ class ExtraSSOptions:
         size: `(H, W)` of the low-resolution frames.
         scenes: their names.
         step: frames' least and largest distance in a scene's own time, uniform between.
+        accumulated: frames that the history of the frame before the target is made of.
+        first: the share of items in which that frame has none.
         samples: of a pixel of the truth.
         crop: `(H, W)` of an item, in low-resolution pixels.
         occlusion_weight: of `hole_loss` where the frame before shows something else.
         perceptual_weight: of the perceptual term.
         perceptual: that term: "vgg", `perceptual_loss`, or without its package "slopes", `slope_loss`.
-        temporal_weight: of eq. 13.
+        temporal_weight: of eq. 13's first term.
+        feature_weight: of its second term. The paper's is 1 too, of features whose size it does not say; compared as
+            "relative" that term is then by far the largest, and the network learns little else: after 2,500 steps what
+            it made was 4.5 dB below its bilinear upsampling.
         disoccluded: whether what is disoccluded counts in eq. 13's first term, as printed; see `temporal_loss`.
         features: how features are compared in its second term, see `feature_difference_loss`.
         validation: examples that validation looks at.
@@ -69,20 +75,24 @@ class ExtraSSOptions:
     size: Size = (90, 160)
     scenes: tuple[str, ...] = MOVING
     step: tuple[float, float] = (0.5, 1.5)
+    accumulated: int = 8
+    first: float = 0.125
     samples: int = 16
     crop: Size = (64, 64)
     occlusion_weight: float = 1.0
     perceptual_weight: float = 0.01
     perceptual: Literal["vgg", "slopes"] = "vgg"
     temporal_weight: float = 1.0
+    feature_weight: float = 0.01
     disoccluded: bool = False
     features: Scale = "relative"
     validation: int = 24
 
     def __post_init__(self) -> None:
-        for name in ("occlusion_weight", "perceptual_weight", "temporal_weight"):
+        for name in ("occlusion_weight", "perceptual_weight", "temporal_weight", "feature_weight"):
             check_range(self, name, least=0)
-        for name in ("samples", "validation"):
+        check_range(self, "first", least=0, most=1)
+        for name in ("accumulated", "samples", "validation"):
             check_range(self, name, least=1)
         for name in self.scenes:
             check_choice("scenes", name, scene_names())
@@ -96,13 +106,15 @@ class ExtraSSOptions:
 class ExtraSSTask:
     """Trains the `ExtraSSNet` of an `ExtraSS` on two frames in a row; its FRNet only prepares what that is shown.
 
-    The frame before the target is super sampled as the first one of a run. Its answer, warped, is the history of the
-    target, which is answered twice: as a rendered frame, and extrapolated from the rendered frames one and three before
-    it. So both encoders see one frame, and both answers are compared with one truth.
+    The frame before the target is super sampled with what "taau" makes of the frames before it as its history, or as
+    the first one of a run. Its answer, warped, is the history of the target, which is answered twice: as a rendered
+    frame, and extrapolated from the rendered frames one and three before it. So both encoders see one frame, and both
+    answers are compared with one truth.
 
     An example holds arrays at the input's size, those of the output's size by `pixel_unshuffle`: "before", the frame
-    before the target; "color", the target rendered, "refined" and "guided", extrapolated; "albedo"; "depths" and
-    "jitters" of both frames; "motion" to the frame before and "holes" there, of the output; "truths" of both.
+    before the target, and "history", the answer before that; "color", the target rendered, "refined" and "guided",
+    extrapolated; "albedo"; "depths", "jitters" and "motions" to the frame before, of both frames; "holes" there, of the
+    target; "truths" of both.
 
     References: Wu et al. 2023 (ExtraSS), eq. 11-14. Departures: `disoccluded` and `features`, where the printed losses
     are least for ghosts and for no features at all, and the frame before is supervised too, by eq. 12.
@@ -120,7 +132,9 @@ class ExtraSSTask:
             refining = self._frnet.config
         self._config = ExtraSSConfig(refining, options.sampler)
         self._stages = extrass(self.init(nnx.Rngs(0)), preparation=self._preparation)
-        self._numbers = range(1 - 2 * self._stages.past, 1)  # of the frames of an example, the last one the target
+        self._accumulating = taau(options.sampler.scale)
+        # of the frames of an example, the last one the target
+        self._numbers = range(min(1 - 2 * self._stages.past, -1 - options.accumulated), 1)
         # scenes are compiled each, what is made of their frames once
         self._draw, self._prepared = jax.jit(self._drawing), jax.jit(self._prepare)
         self._held: list[Example] = []
@@ -157,16 +171,18 @@ class ExtraSSTask:
 
     def _prepare(self, frames: Frame, truths: Float[Array, "two i j 3"]) -> Example:
         """What the network is shown of them."""
-        scale, (height, width) = self.options.sampler.scale, self.options.size
+        scale, (height, width), method = self.options.sampler.scale, self.options.size, self._stages
         *seen, target = (jax.tree.map(lambda leaf, k=k: leaf[k], frames) for k in range(len(self._numbers)))
-        *history, before = (hide(frame) if k % 2 else frame for k, frame in enumerate(seen))  # every other one rendered
-        method, history = self._stages, tuple(history)
+        needed = seen[1 - 2 * method.past :]
+        # every other one rendered
+        *history, before = (hide(frame) if k % 2 else frame for k, frame in enumerate(needed))
+        history = tuple(history)
         carry = method.init(history, before)
         at = functools.partial(method.values_before, "super sampling", method.state, carry)
         first, extrapolated = at(history, before), at((*history, before), hide(target))
         rendered = at((*history, before), target)
         refined, _, depth, _, guided, albedo = extrapolated["sampled"]
-        motion = upsampled_motion(extrapolated["history"], extrapolated["target"], scale)
+        motions = [upsampled_motion(values["history"], values["target"], scale) for values in (first, extrapolated)]
         jitters = jnp.concatenate([jnp.asarray(frame.jitter) for frame in (before, target)])
         return {
             "before": first["sampled"][0],
@@ -176,10 +192,22 @@ class ExtraSSTask:
             "albedo": albedo,
             "depths": jnp.concatenate([first["sampled"][2], depth], -1),
             "jitters": jnp.broadcast_to(jitters, (height, width, 4)),
-            "motion": pixel_unshuffle(motion[None], scale)[0],
+            "history": pixel_unshuffle(self._preparation.encode(self._accumulated(frames))[None], scale)[0],
+            "motions": jnp.concatenate([*pixel_unshuffle(jnp.stack(motions), scale)], -1),
             "holes": extrapolated["holes"].astype(depth.dtype),
             "truths": jnp.concatenate([*pixel_unshuffle(self._preparation.encode(truths), scale)], -1),
         }
+
+    def _accumulated(self, frames: Frame) -> Float[Array, "i j 3"]:
+        """The answer of "taau" to the frame two before the target, from all frames before."""
+        first, count = jax.tree.map(lambda leaf: leaf[0], frames), len(self._numbers) - 2
+        pairs = [jax.tree.map(lambda leaf, k=k: leaf[k : count - 1 + k], frames) for k in (0, 1)]
+        carry, image = self._accumulating.step(self._accumulating.init((), first), (), first)
+
+        def step(kept: Any, pair: Any) -> tuple[Any, None]:
+            return self._accumulating.step(kept[0], (pair[0],), pair[1]), None
+
+        return jax.lax.scan(step, (carry, image), tuple(pairs))[0][1]
 
     def _drawn(self, words: list[int], number: int, seeds: range) -> Example:
         rng, options = np.random.default_rng([*words, number]), self.options
@@ -196,8 +224,11 @@ class ExtraSSTask:
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *examples)
 
     def sample(self, example: Example, key: PRNGKeyArray) -> Batch:
-        """A random crop."""
-        return crop(example, key, size=self.options.crop)
+        """A random crop; of the share `first` without a history, as the first frame of a run."""
+        place, chance = jax.random.split(key)
+        batch = crop(example, place, size=self.options.crop)
+        first = jax.random.bernoulli(chance, self.options.first)
+        return batch | {"history": jnp.where(first, jnp.nan, batch["history"])}
 
     def loss(self, model: nnx.Module, batch: Batch) -> tuple[Array, Mapping[str, Array]]:
         """Eq. 14: the mean of eq. 12 over three answers, and eq. 13 over the two to the target."""
@@ -217,7 +248,8 @@ class ExtraSSTask:
         parts["features"] = jnp.mean(compare(shown["color"].features, shown["refined"].features))
         spatial = parts["l1"] + options.occlusion_weight * parts["occlusion"]
         spatial += options.perceptual_weight * parts["perceptual"]
-        return spatial + options.temporal_weight * (parts["temporal"] + parts["features"]), parts
+        temporal = options.temporal_weight * parts["temporal"] + options.feature_weight * parts["features"]
+        return spatial + temporal, parts
 
     def validate(self, model: nnx.Module) -> tuple[Mapping[str, float], Mapping[str, Any]]:
         """dB after the tone curve: "psnr_rendered", "psnr_extrapolated", and "gain" over their bilinear upsampling."""
@@ -245,10 +277,17 @@ def _answers(model: Any, batch: Batch) -> dict[str, Any]:
     def larger(image: Array, jitter: Array) -> Array:
         return upsample(image, scale=scale, jitter=jitter)
 
-    before = sampler(batch["before"], larger(batch["before"], earlier), depths[0], earlier)
-    motion = pixel_shuffle(batch["motion"], scale)
-    warped = jax.vmap(backward_warp)(before.image, motion)
-    known = jax.vmap(in_frame)(motion)[..., None]
+    motions = [pixel_shuffle(part, scale) for part in jnp.split(batch["motions"], 2, -1)]
+
+    def fetched(image: Array, motion: Array, color: Array, jitter: Array) -> tuple[Array, Array, Array]:
+        """An answer along the motion, where there is one, and the history: that, or else the frame, upsampled."""
+        warped = jax.vmap(backward_warp)(image, motion)
+        known = jax.vmap(in_frame)(motion)[..., None] & jnp.all(jnp.isfinite(warped), -1, keepdims=True)
+        return warped, known, jnp.where(known, warped, larger(color, jitter))
+
+    history = fetched(pixel_shuffle(batch["history"], scale), motions[0], batch["before"], earlier)[2]
+    before = sampler(batch["before"], history, depths[0], earlier)
+    warped, known, _ = fetched(before.image, motions[1], batch["before"], earlier)
     nearest = functools.partial(upsample, scale=scale, filter="nearest")
     holes = jax.vmap(lambda image, jitter: nearest(image, jitter=jitter))(batch["holes"], now)
     found: dict[str, Any] = {"before": before, "warped": warped, "truth before": truths[0], "truth": truths[1]}
