@@ -11,7 +11,7 @@ from marks import slow
 
 import jaxtrapolate as jx
 from jaxtrapolate.methods.extrass import Refinement, extrass_refine
-from jaxtrapolate.methods.shading import steps_on
+from jaxtrapolate.methods.shading import _gained, steps_on
 from jaxtrapolate.networks import FRNet, FRNetConfig
 from jaxtrapolate.records import Frame, GBuffer, replace
 
@@ -77,6 +77,38 @@ def test_shadow_goes_on(past):
     before, after = (db(method(name)(history, target), truth) for name in ("guided_warp", "shading_warp"))
     assert after > before + 8
     assert after > 38
+
+
+def test_shadow_that_speeds_up_goes_on_speeding_up():
+    """Its place is a square of the time; with even steps what it gains on its mean is 3/8 of what the last step did."""
+    flow, then = jnp.full((3, 4, 2), -5.0), (jnp.full((3, 4, 2), -3.0), jnp.ones((3, 4, 1)))
+    still, sure = jnp.zeros((3, 4, 2)), jnp.ones((3, 4, 1))
+    half, one, two = (jnp.float32(v) for v in (0.5, 1, 2))
+    np.testing.assert_allclose(_gained(flow, sure, then, still, half, one), -2 * 0.375, rtol=1e-6)
+    np.testing.assert_array_equal(_gained(flow, 0 * sure, then, still, half, one), 0)
+    np.testing.assert_array_equal(_gained(flow, sure, (-then[0], then[1]), still, half, one), 0)  # it turned: no trust
+    place = lambda t: 7 - 2 * t + 0.3 * t**2  # noqa: E731
+    flow, earlier = place(-3.0) - place(-1.0), place(-4.0) - place(-3.0)  # the newest at -1, then -3 and -4
+    gained = _gained(*(jnp.full((1, 1, k), v) for k, v in ((2, flow), (1, 1.0))), (jnp.full((1, 1, 2), earlier),
+                     jnp.ones((1, 1, 1))), jnp.zeros((1, 1, 2)), half, two)  # fmt: skip
+    np.testing.assert_allclose(gained + 0.5 * flow, place(-1.0) - place(0.0), rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_shadows_that_speed_up_and_slow_down():
+    """With its acceleration light is as near as without any; without, one of the two is not."""
+
+    def make(time, fast):
+        return frame(time, at=48 + fast * time * abs(time) / 2)
+
+    found = []
+    for fast in (-0.25, 0.0, 0.25):
+        history, target, truth = window(3, functools.partial(make, fast=fast))
+        made = [method("shading_warp").replace(acceleration=a)(history, target) for a in (0.0, 1.0)]
+        found.append([db(image, truth) for image in made])
+    without, with_it = np.transpose(found)
+    assert np.ptp(with_it) < 1
+    assert with_it.min() > without.min() + 2
 
 
 @pytest.mark.slow

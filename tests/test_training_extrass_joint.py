@@ -123,11 +123,12 @@ def test_an_example_of_a_scene():
     frame = render(world, time, size=(24, 34), previous_time=time - step)
     motion = pixel_shuffle(made["motions"][None, ..., 8:])[0]
     assert np.median(np.abs(motion - frame.motion)) < 0.02
-    method, history = jx.load("taau"), ()
+    method, history, carry, image = jx.load("taau"), (), None, None
     for number in range(task._numbers[0], -1):
         now = render(world, time + number * step, size=(12, 17), jitter=jnp.asarray(jitters[number - 1]),
                      previous_time=time + (number - 1) * step)  # fmt: skip
-        carry, image = method.step(carry if history else method.init((), now), history, now)
+        carry = method.init((), now) if carry is None else carry
+        carry, image = method.step(carry, history, now)
         history = (now,)
     shown = pixel_shuffle(made["history"][None])[0]
     assert np.mean(np.abs(shown - curve(image)) > 1e-3) < 0.01

@@ -62,6 +62,7 @@ class Continued(FlowOfLight):
     """Of the flow of light, and of how far it is believed."""
 
     agreement: float = option(0.5, "where trust begins: share of the error without the flow", low=0, high=1)
+    acceleration: float = option(1.0, "how much of its acceleration between three frames light keeps", low=0, high=1)
 
 
 @settings
@@ -190,16 +191,37 @@ def _continue(state, values: Values):
         first, second, seen = then
         pairs.append(Pair(first, second, seen, guides[1]))
     (flow, trust), *others = _flows(pairs, how, hidden=True)
+    onward = steps_on(history, places[1], places[0], values["target"], len(history) - places[0])
+    moved = onward.astype(flow.dtype) * flow
     if then is not None:
         steps = steps_on(history, places[2], places[1], newest, places[0] - places[1])
+        more = _gained(flow, trust, others[0], values["motion"], onward, steps)
+        moved = moved + jnp.asarray(how.acceleration, flow.dtype) * more
         truth = compress(values["layers"][0][..., :3])
         better = _better(pairs[1], others[0][0], steps, truth)
         x, y, _ = landing(values["motion"])
         agreed = jnp.clip((from_blocks(better, x, y) - how.agreement) / _SURE, 0, 1)
         trust = trust * agreed.astype(trust.dtype)
-    steps = steps_on(history, places[1], places[0], values["target"], len(history) - places[0])
-    flow = steps.astype(flow.dtype) * flow
-    return {"light": backward_warp(pairs[0].first, flow), "trust": trust, "light_flow": flow}
+    return {"light": backward_warp(pairs[0].first, moved), "trust": trust, "light_flow": moved}
+
+
+def _gained(flow: Array, trust: Array, then: tuple[Array, Array], motion: Array, onward: Array, steps: Array) -> Array:
+    """By how much light gets on further than by its mean motion, if it keeps its acceleration, where both are trusted.
+
+    Args:
+        flow: `[H, W, 2]`, of the light from the newest frame to the one before, at the target.
+        trust: in that.
+        then: the same of the two frames before, at the newest.
+        motion: from the target to the newest.
+        onward: the time from the newest to the target, over that from the one before to the newest.
+        steps: that, over the time between the two before.
+    """
+    there = backward_warp(jnp.concatenate(then, -1), motion)
+    change = flow - steps.astype(flow.dtype) * there[..., :2]
+    onward, steps = onward.astype(flow.dtype), steps.astype(flow.dtype)
+    size, limit = (jnp.sum(jnp.square(a), -1, keepdims=True) for a in (change, flow))
+    known = (trust > 0.5) & (there[..., 2:] > 0.5) & (size < limit)
+    return jnp.where(known, divide(onward * (1 + onward) * steps, 1 + steps) * change, 0)
 
 
 def _stays(state, values: Values):
