@@ -51,7 +51,7 @@ def _block_sums_jvp(primals, tangents):
     return block_sums(image), jnp.sum(padded, (1, 3))[..., None]
 
 
-def from_blocks(values: Float[Array, "i j 1"], x: Array, y: Array) -> Float[Array, "h w 1"]:
+def from_blocks(values: Float[Array, "i j c"], x: Array, y: Array) -> Float[Array, "h w c"]:
     """What blocks of 8 x 8 pixels have, at positions x, y `[H, W]` of an image, bilinear between their centres."""
     return sample(values, (x + 0.5) / _BLOCK - 0.5, (y + 0.5) / _BLOCK - 0.5)
 

@@ -62,7 +62,7 @@ class Continued(FlowOfLight):
     """Of the flow of light, and of how far it is believed."""
 
     agreement: float = option(0.5, "where trust begins: share of the error without the flow", low=0, high=1)
-    acceleration: float = option(1.0, "how much of its acceleration between three frames light keeps", low=0, high=1)
+    acceleration: float = option(0.5, "how much of its acceleration between three frames light keeps", low=0, high=1)
 
 
 @settings
