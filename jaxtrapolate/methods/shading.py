@@ -266,7 +266,8 @@ def light_stages(space: Space | None = None) -> tuple[Stage, ...]:
 
     The light of the rendered frame before the newest is fetched to the target's surfaces too; the flow between the two
     goes on. It is trusted where the same procedure, from the two frames before it, would have predicted the newest
-    better ("light in hindsight"); with two rendered frames the flow's own confidence decides.
+    better ("light in hindsight"), and where the flow of those is trusted too, light keeps a part of its acceleration.
+    With two rendered frames the flow's own confidence decides.
 
     Args:
         space: in which colours are fetched; `None` = the method's option.
@@ -304,9 +305,11 @@ def light_stages(space: Space | None = None) -> tuple[Stage, ...]:
 def shading_warp() -> Method:
     """The guided warp whose shadows and highlights move on as older frames show, and whose holes older frames fill.
 
-    Ours. Light moves on where hindsight agrees; with two rendered frames the flow's own confidence decides, with one it
-    is the guided warp. What is hidden in the newest is looked for in the two older frames, then in what is remembered
-    of all before: the method has memory (`step`), without which it knows these two alone.
+    Ours. Light moves on where hindsight agrees, and keeps half of its acceleration: 0.02 dB more on nine training
+    sequences, in moving shadow up to 0.4 (all of it does no more, and costs more where the flow is but noise). With two
+    rendered frames the flow's own confidence decides, with one it is the guided warp. What is hidden in the newest is
+    looked for in the two older frames, then in what is remembered of all before: the method has memory (`step`),
+    without which it knows these two alone.
     """
     first = (reproject_stage(3), HOLES, HINDSIGHT, demodulate_stage(), guided_stage())
     stages = (remember_stage(), *first, *light_stages(), seen_before_stage(), modulate_stage(), SKY)

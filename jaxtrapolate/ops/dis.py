@@ -78,7 +78,8 @@ class Guidance(NamedTuple):
 
     def of_patches(self, stride: int) -> Float[Array, "8 8 n"]:
         """Of the patches' pixels: valid, and like the patch's middle."""
-        taps, middles = ([f(image, stride) for image in self.guide] for f in (cut, centres))
+        taps = [cut(image, stride) for image in self.guide]
+        middles = [centres(image, stride)[None, None] for image in self.guide]
         return like(taps, middles) * cut(self.valid, stride)
 
     def of_neighbours(self) -> Weights:

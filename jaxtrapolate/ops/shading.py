@@ -55,8 +55,8 @@ def _guided_enlarged(values, guidance: Guidance, guide):
     shares = [np.outer(*(f if k else 1 - f for f, k in zip(further, place, strict=True))) for place in places]
     alike = [like(tuple(jnp.take(images[i][1], indices[0][j], 1)), tuple(guide)) for j, i in places]
     weights = once([(weight + _UNLIKE) * share for weight, share in zip(alike, shares, strict=True)])
-    parts = [w * jnp.take(images[i][0], indices[0][j], 1) for w, (j, i) in zip(weights, places, strict=True)]
-    return sum(parts[1:], parts[0]) / sum(weights[1:], weights[0])
+    parts = [w[None] * jnp.take(images[i][0], indices[0][j], 1) for w, (j, i) in zip(weights, places, strict=True)]
+    return sum(parts[1:], parts[0]) / sum(weights[1:], weights[0])[None]
 
 
 def _confidence(newer, older, flow, guidance: Guidance, options):
