@@ -57,7 +57,7 @@ def _found(name: str) -> dict[str, Any]:
     """What was found on an input in several runs: of methods that have changed since a run, what the next says."""
     methods: dict[str, Any] = {}
     inputs: dict[str, dict[str, Any]] = {}
-    for run in (name, f"{name}_light", f"{name}_extranet", f"{name}_refine"):
+    for run in (name, f"{name}_light", f"{name}_past"):
         if not (ROOT / f"experiments/results/evaluated/{run}.json").exists():
             continue
         found = read(f"experiments/results/evaluated/{run}.json")
