@@ -38,7 +38,7 @@ from jaxtrapolate.networks.frnet import FRNet, FRNetConfig, Refined
 from jaxtrapolate.networks.inference import inference
 from jaxtrapolate.networks.stored import load_network
 from jaxtrapolate.ops.radiance import By, compress, demodulate, expand, log_decode, log_encode, modulate
-from jaxtrapolate.ops.warp import backward_warp
+from jaxtrapolate.ops.warp import backward_warp, root
 from jaxtrapolate.precision import divide, widest
 from jaxtrapolate.records import GBuffer
 from jaxtrapolate.weights import configured
@@ -191,9 +191,9 @@ def alike(buffers: GBuffer | None, like: Float[Array, "h w c"]) -> Float[Array, 
     if buffers.albedo is not None:
         albedo = jnp.asarray(buffers.albedo, like.dtype)
         apart = jnp.sum(jnp.square(doubled(half(albedo), albedo) - albedo), -1, keepdims=True)
-        found -= jnp.sqrt(apart / 3)
+        found -= root(apart / 3)
     if buffers.normal is not None:
-        normal = jnp.asarray(buffers.normal, like.dtype)
+        normal = jnp.clip(jnp.asarray(buffers.normal, like.dtype), -1, 1)  # no square overflows
         found *= jnp.sum(doubled(half(normal), normal) * normal, -1, keepdims=True)
     return found
 
