@@ -316,10 +316,10 @@ def convention_picture() -> Image.Image:
 
 
 _WRONG = {
-    "walkers": "two casters' light",
-    "street": "a lamp comes into view",
-    "forest": "seen by no frame",
-    "windmill": "a shadow turns",
+    "walkers": "edges of shadows",
+    "street": "a lamp went out",
+    "forest": "thin trunks",
+    "windmill": "shadows that turn",
 }
 """Scenes, and what is wrong where `shading_warp` errs most."""
 
