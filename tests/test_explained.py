@@ -130,9 +130,8 @@ def test_light_on_what_is_dark_is_no_contradiction():
     """Divided by next to no albedo it is bright, but not shown so; what is shown says where a lamp is."""
     first = jnp.full((9, 11, 1), 0.5)
     inputs, correction = (first, first.at[4, 5].set(6.0)), jnp.full((9, 11, 1), 9.0)
-    held = explained(correction, inputs, shown=(first, first.at[4, 5].set(0.6)))
+    held = explained(correction, inputs, shown=lambda image: jnp.log1p(0.01 * jnp.expm1(image)))
     np.testing.assert_allclose(held[3:6, 4:7], 9.0, rtol=1e-6)
-    np.testing.assert_array_equal(explained(correction, inputs, shown=inputs), explained(correction, inputs))
     np.testing.assert_allclose(explained(correction, inputs)[3:6, 4:7], TOLERANCE, rtol=1e-5)
 
 

@@ -83,6 +83,24 @@ def box(image, light):
     return image
 
 
+def test_guides_of_any_size_and_of_no_sigma():
+    """Next to the largest number, or in units of none: what differs is no neighbour, as with a sigma that is small.
+
+    Not to the last bit: smaller images are means, which round.
+    """
+    newer, older = pair()
+    plain = np.zeros((*SIZE, 1), np.float32)
+    sides = plain.copy()
+    sides[:, 60:] = 1
+    expected = jx.shading_flow(newer, older, guide=sides, sigma_guide=1e-12)
+    for guide, sigma in ((3e38 * sides, 0.2), (3e38 * sides, 0.0), (sides, 0.0)):
+        found = jx.shading_flow(newer, older, guide=np.float32(guide), sigma_guide=sigma)
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_allclose(a, b, atol=0.05)
+    still = jx.shading_flow(newer, older, guide=plain, sigma_guide=0.0)
+    np.testing.assert_allclose(still[0], jx.shading_flow(newer, older)[0], atol=1e-4)
+
+
 @pytest.mark.slow
 def test_a_silhouette_stays():
     """The shadow passes behind a box: the guide keeps its motion off the box, bit for bit."""

@@ -297,11 +297,12 @@ def extranet(model: ExtraNet, *, preparation: Preparation = Preparation(), name:
         first, *others = jnp.split(inputs["x"], config.warps, -1)
         if inputs["history"] is not None:
             others += list(inputs["history"][..., :3])
-        images, divisor = (first, *others), values["divisor"]
-        shown = (
-            images if divisor is None else [encode(log_decode(image) * divisor.astype(image.dtype)) for image in images]
-        )
-        correction = explained(answer - first, images, shown=shown, free=inputs["mask"] < 0.5)
+        divisor = values["divisor"]
+
+        def shown(image):
+            return image if divisor is None else encode(log_decode(image) * divisor.astype(image.dtype))
+
+        correction = explained(answer - first, (first, *others), shown=shown, free=inputs["mask"] < 0.5)
         image = log_decode(first + correction)
         guess, own = values["warped"][..., :3], values["warped"][..., 3:]  # undivided, where hindsight asks for it
         if share is not None:  # of the guess 1 - share is left, of its correction 1 - share^2

@@ -4,11 +4,10 @@ A convolution answers to contrast in proportion, so that beside a lamp brighter 
 rings, over surfaces that all its inputs agree on.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
-from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 GAIN = 2.0
@@ -24,17 +23,11 @@ def _widened(image: Float[Array, "h w 1"], reach: int = 1) -> Float[Array, "h w 
     return jax.lax.reduce_window(image, -jnp.inf, jax.lax.max, (size, size, 1), (1, 1, 1), "SAME")
 
 
-def _spread(images: Sequence[Float[Array, "h w c"]], dtype: DTypeLike) -> Float[Array, "h w 1"]:
-    """By how much they differ at most."""
-    stacked = jnp.stack([image.astype(dtype) for image in images])
-    return jnp.max(jnp.max(stacked, 0) - jnp.min(stacked, 0), -1, keepdims=True)
-
-
 def explained(
     correction: Float[Array, "h w c"],
     inputs: Sequence[Float[Array, "h w c"]],
     *,
-    shown: Sequence[Float[Array, "h w c"]] | None = None,
+    shown: Callable[[Array], Array] = lambda image: image,
     free: Bool[Array, "h w 1"] | None = None,
 ) -> Float[Array, "h w c"]:
     """A network's correction, held within what its inputs differ by around a pixel.
@@ -48,14 +41,15 @@ def explained(
     Args:
         correction: what is added to a first guess, in the domain of the inputs: logarithms, or display values.
         inputs: images of what the network was shown, all on the target's grid; finite.
-        shown: the inputs as they would be displayed, modulated; the inputs themselves by default.
+        shown: from an input to what would be displayed, modulated, in the same domain, and growing with it.
         free: where it is not held: holes, of which the inputs show nothing.
 
     Gradient:
         With respect to the correction where it is not held, and with respect to the inputs where it is.
     """
-    spread = _spread(inputs, correction.dtype)
-    contradiction = spread if shown is None else _spread(shown, correction.dtype)
+    stacked = jnp.stack([image.astype(correction.dtype) for image in inputs])
+    most, least = jnp.max(stacked, 0), jnp.min(stacked, 0)
+    spread, contradiction = (jnp.max(a - b, -1, keepdims=True) for a, b in ((most, least), (shown(most), shown(least))))
     believed = jnp.clip(2 - _widened(contradiction, _RINGS) / CONTRADICTED, 0, 1)
     limit = GAIN * _widened(spread) * believed + TOLERANCE
     held = jnp.where(correction > limit, limit, jnp.where(correction < -limit, -limit, correction))

@@ -21,7 +21,8 @@ from jaxtrapolate.ops.warp import pixel_grid
 from jaxtrapolate.precision import divide, widest
 
 _STRIDE, _STEPS, _REFINEMENTS = 3, 3, 2  # of the inverse search: those of the preset "medium"
-_ROWS = 180  # of the working resolution; with 360 a frame of 720 rows takes three times as long
+_ROWS = 180  # of the working resolution; with 360 a frame of 720 rows takes two to three times as long
+_FAR = 1e15  # of guides, in sigmas: no difference's square overflows
 _SOFT = 0.1  # of the gain: from none of the confidence to all of it
 _UNLIKE = 1e-4  # what a pixel counts at least that is unlike, where no other is left
 
@@ -97,7 +98,8 @@ def _shading_flow(
     if guide is not None:
         known = jnp.isfinite(guide)
         valid &= jnp.all(known, -1)
-        guide = jnp.where(known, guide, 0).astype(wide) / jnp.asarray(sigma_guide, wide)
+        sigma = jnp.maximum(jnp.asarray(sigma_guide, wide), 1 / _FAR)
+        guide = jnp.clip(jnp.where(known, guide, 0).astype(wide) / sigma, -_FAR, _FAR)
     guides = jnp.zeros((1, *size), wide) if guide is None else once(jnp.moveaxis(guide, -1, 0))
     least_gain, least_change = (jnp.asarray(a, wide) for a in (least_gain, least_change))
     guidance = Guidance(guides, valid.astype(wide))

@@ -52,11 +52,11 @@ def _by_strips_jvp(function, height, primals, tangents):
 
 
 def once(values: T) -> T:
-    """The value `[rows, ...]`, or all of a tree of as many rows each, computed once.
+    """The value, or each of a tree, all of one axis or more, computed once.
 
     XLA on a CPU computes what several consumers read in each of them, and fuses a window with what it slides over; what
-    a loop reads it computes before. So two rows are put where they are, in a loop: one that puts what it has taken, or
-    takes but one turn, XLA takes out.
+    a loop reads it computes before. So two numbers are put where they are, in a loop: one that puts what it has taken,
+    or takes but one turn, XLA takes out.
     """
     return _once(values)
 
@@ -65,9 +65,10 @@ def once(values: T) -> T:
 def _once(values):
     def step(number, values):
         def put(value):
-            row = jax.lax.dynamic_index_in_dim(value, number, keepdims=True)
-            row = jnp.where(number >= 0, row, jnp.zeros_like(row))  # always, but XLA does not see that
-            return jax.lax.dynamic_update_slice_in_dim(value, row, number, 0)
+            place = (number, *[jnp.zeros_like(number)] * (value.ndim - 1))
+            taken = jax.lax.dynamic_slice(value, place, (1,) * value.ndim)
+            taken = jnp.where(number >= 0, taken, jnp.zeros_like(taken))  # always, but XLA does not see that
+            return jax.lax.dynamic_update_slice(value, taken, place)
 
         return jax.tree.map(put, values)
 
